@@ -17,7 +17,7 @@ from synthetic import folder_state
 import convert
 from scene.dataset_readers import read_scene
 from scene.readers.tracks import read_tracks
-from splatting.sfm import report
+from splatting.sfm import stages
 from splatting.sfm.colmap import Pycolmap, Settings
 from splatting.sfm.images import check_images, prepare_images
 from splatting.sfm.layout import Layout
@@ -299,10 +299,8 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     assert folder_state(copy / "distorted") == work
     # A later failure keeps the scene too, and the record still knows that convert.py made it.
     with monkeypatch.context() as patch:
-        patch.setattr(report, "refuse_nothing", lambda *_: (_ for _ in ()).throw(UserError("no model")))
+        patch.setattr(stages, "refuse_nothing", lambda *_: (_ for _ in ()).throw(UserError("no model")))
         refused("no model", "--mapper", "global")
-    convert.main(["-s", str(copy), "--no_gpu"])
-    assert scene() and not list(copy.glob("images_*"))
 
 
 def test_masks_keep_features_away(converted, tmp_path):
@@ -392,21 +390,21 @@ def test_points_are_computed_at_given_poses(tmp_path, capsys):
         assert all(read_tracks(tmp_path, views, np.zeros(3)))
 
     judge()
-    # The same poses as a text model without points, which other programs write.
+    # A text model without points, as other programs write it, with axes of another convention: no pose is where the
+    # photo shows it to be.
     model = pycolmap.Reconstruction(tmp_path / "sparse" / "0")
-    model.delete_all_points2D_and_points3D()
     (tmp_path / "model").mkdir()
     model.write_text(str(tmp_path / "model"))
-    (tmp_path / "model" / "points3D.txt").unlink()
-    convert.main([*words, str(tmp_path / "model")])
-    judge()
-    # Axes of another convention: no pose is where the photo shows it to be.
-    for frame in content["frames"]:
-        frame["transform_matrix"] = (np.array(frame["transform_matrix"]) * (1, -1, -1, 1)).tolist()
-    poses.write_text(json.dumps(content))
+    for name in ("points3D", "rigs", "frames"):
+        (tmp_path / "model" / f"{name}.txt").unlink()
+    lines = []
+    for image in model.images.values():
+        (x, y, z, w), (right, down, ahead) = image.cam_from_world().rotation.quat, image.cam_from_world().translation
+        lines.append(f"{image.image_id} {-x} {w} {-z} {y} {right} {-down} {-ahead} 1 {image.name}\n\n")
+    (tmp_path / "model" / "images.txt").write_text("".join(lines))
     before = folder_state(tmp_path / "sparse")
     with pytest.raises(UserError, match=r"the photos do not fit the given poses \(\d points.*or omit --poses"):
-        convert.main([*words, str(poses)])
+        convert.main([*words, str(tmp_path / "model")])
     assert folder_state(tmp_path / "sparse") == before
 
 

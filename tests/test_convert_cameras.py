@@ -108,12 +108,12 @@ def test_who_shares_a_camera(tmp_path, mode, found):
     assert len(said.splitlines()) == (1 if mode == "per_photo" else len(found) + 1)
 
 
-def photos(scene: Path, told: bool) -> None:
-    """Photos of a room, every second one through another lens; told: EXIF says so."""
+def photos(scene: Path) -> None:
+    """Photos of a room, every second one through another lens; EXIF says so."""
     make_photos(scene / "input", VIEWS, focals=(FOCAL, TELE * FOCAL))
     for number, path in enumerate(sorted((scene / "input").iterdir())):
         film = round(FILM * TELE ** (number % 2))
-        made = exif(FocalLengthIn35mmFilm=film, LensModel=("wide", "tele")[number % 2]) if told else Image.Exif()
+        made = exif(FocalLengthIn35mmFilm=film, LensModel=("wide", "tele")[number % 2])
         Image.open(path).save(path.with_suffix(".jpg"), quality=97, subsampling=0, exif=made)
         path.unlink()
 
@@ -130,7 +130,7 @@ def strayed(scene: Path) -> np.ndarray:
 
 @pytest.mark.slow
 def test_each_lens_gets_its_camera(tmp_path, capsys):
-    photos(tmp_path, told=True)
+    photos(tmp_path)
     convert.main(["-s", str(tmp_path), "--no_gpu"])
     assert strayed(tmp_path).max() < 0.02  # of 4 to the corner
     wide, tele = (f"Maker Phone 3, {lens}, as {film} mm on 35 mm film" for lens, film in (("wide", 33), ("tele", 53)))
@@ -147,14 +147,6 @@ def test_each_lens_gets_its_camera(tmp_path, capsys):
     database.close()
     # As wide as on film means here: as much of the diagonal, 43.27 mm.
     assert first == pytest.approx([film * np.hypot(*SIZE) / np.hypot(36, 24) for film in (33, 53)], rel=1e-3)
-
-
-@pytest.mark.slow
-def test_without_exif_each_photo_may_have_its_camera(tmp_path, capsys):
-    photos(tmp_path, told=False)
-    convert.main(["-s", str(tmp_path), "--no_gpu", "--cameras", "per_photo"])
-    assert strayed(tmp_path).max() < 0.1 and len(strayed(tmp_path)) == VIEWS
-    assert "10 cameras, one for each photo\n" in capsys.readouterr().out
 
 
 def survey(*factors: float, gain: float = 0.5) -> list[dict]:
