@@ -170,7 +170,7 @@ def test_sound_photos_are_passed():
     edges = np.where(np.indices((48, 64))[1] < 30, 255, 0) + np.where(np.indices((48, 64))[1] == 30, 100, 0)
     for info in (_with_photos(COLORS), _with_photos((GREY * 257).astype(np.uint16)), _alpha(edges, 255)):
         assert said(info) == ""
-    assert said(_alpha(0, 0), alpha=False) == ""
+    assert said(_alpha(0, 0), options=argparse.Namespace(mask_meaning="none")) == ""
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from splatting.distributed.ranks import ranks
 from splatting.files.json_files import write_json
 from splatting.findings import Finding, note
 from splatting.findings.model import load_scored
-from splatting.findings.scene import of_options, tell
+from splatting.findings.scene import findings, tell
 from splatting.registry import check_together, chosen, options_of, tools
 from utils.system_utils import UserError, mkdir_p
 
@@ -51,7 +51,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
     if trains:
-        tell(of_options(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
+        tell(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
     found += [note(*one) for advise_part in tools("advise") for one in advise_part(scene, tracks)]

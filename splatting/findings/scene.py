@@ -25,23 +25,20 @@ MOST_PHOTOS = 100  # and the doctor
 _LINES = 5  # most findings that a training prints
 
 
-def findings(info: SceneInfo, most: int = LOOKED_AT, halves: bool = False, alpha: bool = True) -> list[Finding]:
+def findings(
+    info: SceneInfo, options: argparse.Namespace | None = None, halves: bool = False, most: int = LOOKED_AT
+) -> list[Finding]:
     """Faults of the records that readers return, the worst first; none if nothing is wrong.
 
-    most: photos that are decoded. halves: test views train, too, with their left halves.
-    alpha: that of photos counts (--mask_meaning).
+    options: the model options of a training; code written for the reference lacks those that we added. halves: test
+    views train, too, with their left halves. most: photos that are decoded.
     """
+    alpha = getattr(options, "mask_meaning", "") != "none"
     train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
     of_files = *of_photos(info, most, alpha), *of_damage(info, most), *of_duplicates(info, halves)
     found = [*of_cameras(info), *of_files, *of_points(info)]
     return sorted(found, key=lambda one: -one.severity)
-
-
-def of_options(info: SceneInfo, options: argparse.Namespace, halves: bool) -> list[Finding]:
-    """`findings` with the model options of a training; code written for the reference lacks those that we added."""
-    alpha = getattr(options, "mask_meaning", "") != "none"
-    return findings(info, halves=halves, alpha=alpha)
 
 
 def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:
@@ -66,7 +63,7 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         print(text)
     if not resumed:
         smallest = min((view.image_width, view.image_height) for view in views)
-        found = [*of_options(info, options, scene.halves), *hints(info, smallest, options.white_background)]
+        found = [*findings(info, options, scene.halves), *hints(info, smallest, options.white_background)]
         tell(found, options.source_path)
     if info.offset.any():
         print(
@@ -91,7 +88,7 @@ def check_dataset(source: str, images: str) -> list[Finding]:
         return [*_notes(said.getvalue()), from_error(error)]
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
-    checks += [findings(info, MOST_PHOTOS)]
+    checks += [findings(info, most=MOST_PHOTOS)]
     if not any(of_lenses(info)):  # else poses and colours have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
