@@ -123,7 +123,7 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
 def tools(name: str) -> list[Callable]:
     """The functions of a name that parts have for other commands than train.py, in their tools.py (`Part.tools`).
 
-    advise(scene, tracks): texts on a scene, and options of train.py that they speak for.
+    advise(scene, tracks): findings on a scene, and options of train.py that they speak for.
     beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
     advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
     drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),

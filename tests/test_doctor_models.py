@@ -101,7 +101,7 @@ def test_a_photo_that_somebody_walked_into_is_named(trained, scene, tmp_path):
     Image.fromarray(pixels).save(photo)
     for folder, named in ((scene, []), (other, [photo.name])):
         lines = check_model(str(trained), -1, str(folder))
-        found = [line.text for line in lines if line.severity == Severity.NOTE and "passers-by" in line.text]
+        found = [str(line) for line in lines if line.severity == Severity.NOTE and "passers-by" in line.text]
         assert ["most in " + name + ";" in text for text, name in zip(found, named, strict=True)] == [True] * len(named)
 
 

@@ -54,7 +54,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
         tell(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     found = [*_of_tracks(scene, tracks)] if any(tracks) else []
-    found += [note(*one) for advise_part in tools("advise") for one in advise_part(scene, tracks)]
+    found += [one for advise_part in tools("advise") for one in advise_part(scene, tracks)]
     return [*found, *_of_short_training(dataset)] if trains else found
 
 
@@ -171,4 +171,5 @@ def _of_short_training(dataset: argparse.Namespace) -> Iterator[Finding]:
         own += ["--no_last_checkpoint"]
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
         scene, views = load_scored(folder)
-        yield from (note(*one) for advise_part in tools("advise_trained") for one in advise_part(scene, views))
+        for advise_part in tools("advise_trained"):
+            yield from advise_part(scene, views)

@@ -22,7 +22,7 @@ from scene.saved_model import load_saved
 from splatting.evaluation.model_folder import closing_lines, curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
-from splatting.findings import Finding, fine, from_error, note
+from splatting.findings import Finding, fine, from_error
 from splatting.findings.changes import FITS as BAD_PSNR
 from splatting.findings.changes import LOST, NEAR, of_scene, recorded_psnr, strange_photos, what_changed
 from splatting.findings.scene import check_dataset
@@ -171,7 +171,7 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Finding]:
 def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
     """What parts of a training say of a trained model."""
     for examine in tools("examine"):
-        yield from (note(text) for text in examine(scene, _scored(scene, options), options))
+        yield from examine(scene, _scored(scene, options), options)
 
 
 def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:

@@ -10,16 +10,17 @@ from scene.images import exposures as by_points
 from scene.images.exposures import EXPOSURES
 from scene.readers.tracks import Track
 from scene.scene import Scene
+from splatting.findings import Finding, note
 from utils.image_utils import as_float
 
 
-def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[tuple[str, str]]:
-    """Texts, and the options that they speak for, or none."""
+def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+    """Numbers of a scene, and the options that they speak for."""
     if any(tracks):
         cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
         spread = float(np.std(exposures(cameras, tracks)))
         asked = "--appearance ppisp" if spread > EXPOSURES else ""
-        yield f"exposures of the photos differ by {spread:.2f} stops", asked
+        yield note(f"exposures of the photos differ by {spread:.2f} stops", asked)
 
 
 def exposures(cameras: list[Camera], tracks: list[Track | None]) -> np.ndarray:

@@ -7,15 +7,16 @@ from torch import Tensor
 
 from scene.readers.tracks import Track
 from scene.scene import Scene
+from splatting.findings import Finding, note
 from splatting.parts.sky.directions import FEWEST
 from splatting.parts.sky.shell import Shell, find_sky, said_of_sky
 
 
-def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[tuple[str, str]]:
-    """Texts, and the options that they speak for, or none."""
+def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+    """Numbers of a scene, and the options that they speak for."""
     if len(scene.info.point_cloud.points):
         _, share = find_sky(scene, Shell.around(scene.info))
-        yield said_of_sky(share), "--sky auto" if share >= FEWEST else ""
+        yield note(said_of_sky(share), "--sky auto" if share >= FEWEST else "")
 
 
 def beside(facts: dict[str, Any], means: Tensor) -> Tensor | None:
