@@ -56,7 +56,7 @@ def _files(name: str) -> Iterator[Path]:
     The reference's functions have parameters with names of its options.
     """
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
-    known = ROOT / "splatting" / "registry.py", ROOT / "scene" / "readers" / "reference.py"
+    known = ROOT / "splatting" / "registry.py", ROOT / "scene" / "dataset_readers.py"
     yield from (path for path in found if FOLDER / name not in path.parents and path not in known)
 
 

@@ -3,8 +3,6 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import spsolve
 
 EXPOSURES = 0.4  # stops; photos of a usual automatic exposure differ by 0.15 to 0.35
 _DARK, _LIGHT = 0.02, 0.98  # of a channel; beyond, an exposure cannot be told
@@ -43,6 +41,9 @@ def _fitted(
     Points are eliminated (Triggs et al. 2000, section 6.1). To fit both by turns would take as many rounds as a walk
     has photos.
     """
+    from scipy import sparse  # it takes a while to import
+    from scipy.sparse.linalg import spsolve
+
     pairs = sparse.coo_array((weight, (photo, point)), (photos, point.max(initial=0) + 1)).tocsr()
     of_point, of_photo = (np.maximum(pairs.sum(axis), 1e-9) for axis in (0, 1))
     matrix = sparse.diags_array((1 + 1e-9) * of_photo) - pairs / of_point @ pairs.T  # singular else: their sum is free

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.readers.tracks import Track, projected, rays_to, read_tracks
@@ -187,9 +186,16 @@ def check_colors(info: SceneInfo, tracks: Sequence[Track | None] = ()) -> Iterat
         yield from _strange(photos)
 
 
+def _nearest(points: np.ndarray, places: np.ndarray, count: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Distances from places to the nearest of points (N, 3), and their indices; count: how many of them."""
+    from scipy.spatial import KDTree  # it takes a while to import
+
+    return KDTree(points).query(places, k=count)
+
+
 def _are_random(cloud: BasicPointCloud) -> bool:
     """Whether colours are those of a cloud that is made up, as for scenes without points."""
-    neighbours = KDTree(cloud.points).query(cloud.points, k=2)[1][:, 1]
+    neighbours = _nearest(cloud.points, cloud.points, count=2)[1][:, 1]
     others = np.random.default_rng(0).permutation(len(neighbours))
     near, far = (np.abs(cloud.colors - cloud.colors[chosen]).mean() for chosen in (neighbours, others))
     return bool(near > _RANDOM * far)
@@ -211,7 +217,7 @@ def _apart(info: SceneInfo, seen: Sequence[np.ndarray], text: str) -> tuple[str,
     if not seen:
         remedy = "check that all are of one reconstruction: axes and unit of the points, names of the photos"
         return f"cameras and points, or cameras and photos, do not fit together: {text}", remedy
-    away = KDTree(info.point_cloud.points).query(np.concatenate(seen)[:: max(1, sum(map(len, seen)) // _SAMPLE)])[0]
+    away = _nearest(info.point_cloud.points, np.concatenate(seen)[:: max(1, sum(map(len, seen)) // _SAMPLE)])[0]
     if np.median(away) > _SAME * (info.extent or 1.0):
         remedy = "start from the points of the cameras' own reconstruction, in its axes and unit"
         return f"cameras and points do not fit together: {text}", remedy

@@ -252,7 +252,7 @@ def test_ranks(scene, tmp_path, once):
 def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
     monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     found, begin = [], run.Run.begin
-    monkeypatch.setattr(run.Run, "begin", lambda self: (found.append(self.sleeping is not None), begin(self)))
+    monkeypatch.setattr(run.Run, "begin", lambda self, *x: (found.append(self.sleeping is not None), begin(self, *x)))
     trained(scene, tmp_path, *options)
     assert found == [sleeps]
 
