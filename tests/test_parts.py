@@ -28,7 +28,8 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ("no_curve", "splatting/findings/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
     ("schedule", "scene/gaussians/reference_names.py"),
-    ("train_test_exp", "scene/cameras.py"),  # what functions of the reference take
+    *((option, "scene/dataset_readers.py") for option in ("depths", "train_test_exp")),  # what the reference's take
+    ("train_test_exp", "scene/cameras.py"),
     *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
     *((f"exposure_lr_{end}", "full_eval.py") for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
     ("train_test_exp", "full_eval.py"),
@@ -51,13 +52,10 @@ def _options(name: str) -> set[str]:
 
 
 def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: those outside of its folder, but the registry.
-
-    The reference's functions have parameters with names of its options.
-    """
+    """All Python files of the project that may not know a part: those outside of its folder, but the registry."""
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
-    known = ROOT / "splatting" / "registry.py", ROOT / "scene" / "dataset_readers.py"
-    yield from (path for path in found if FOLDER / name not in path.parents and path not in known)
+    registry = ROOT / "splatting" / "registry.py"
+    yield from (path for path in found if FOLDER / name not in path.parents and path != registry)
 
 
 @cache
