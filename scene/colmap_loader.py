@@ -335,14 +335,14 @@ class _BinaryFile:
     def points(self) -> tuple[Points, "_Numbered"]:
         """The points, and the place of each."""
         content, starts, count = self._content, [], 1
-        number, record, seen_at = struct.Struct("<Q"), self._POINT.itemsize, self._POINT.fields["seen"][1]
+        number, record, length_at = struct.Struct("<Q"), self._POINT.itemsize, self._POINT.fields["seen"][1]
         at = number.size
         try:
             (count,) = self.take("Q")
             while len(starts) < count:
-                (seen,) = number.unpack_from(content, at + seen_at)
+                (length,) = number.unpack_from(content, at + length_at)
                 starts.append(at)
-                at += record + self._TRACK * seen
+                at += record + self._TRACK * length
             if at > len(content):
                 raise struct.error
         except (struct.error, OverflowError) as error:

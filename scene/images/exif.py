@@ -33,7 +33,7 @@ class Lens(NamedTuple):
     zoom: float = 0.0
 
     @property
-    def known(self) -> bool:
+    def tells_apart(self) -> bool:
         """Whether the record tells lenses of one device apart."""
         return bool(self.lens or self.focal or self.film)
 

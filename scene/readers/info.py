@@ -255,7 +255,9 @@ def are_exchanged(photo: tuple[int, int], camera: tuple[int, int]) -> bool:
     return abs(width * w / h - height) <= 1 < abs(width * h / w - height)
 
 
-def turned(names: Sequence[str], count: int, photo: tuple[int, int], camera: tuple[int, int]) -> tuple[str, str]:
+def exchanged_sides(
+    names: Sequence[str], count: int, photo: tuple[int, int], camera: tuple[int, int]
+) -> tuple[str, str]:
     """What to say of photos whose sides are exchanged, the first of these sizes, of `count`; and the remedy."""
     size, other = (f"{width} x {height}" for width, height in (photo, camera))
     return (

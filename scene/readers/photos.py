@@ -31,7 +31,7 @@ from scene.images.lens import (
     visible_pixels,
 )
 from scene.images.masks import TRANSPARENT, Mask
-from scene.readers.info import CameraInfo, are_exchanged, turned
+from scene.readers.info import CameraInfo, are_exchanged, exchanged_sides
 from splatting.files.folders import cache_folder, remove_temporary_files
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.plain_files import plain
@@ -139,7 +139,8 @@ def _check_shapes(cameras: Sequence[CameraInfo]) -> None:
     """UserError if photos would be stretched from upright to lying, or the other way round; a message if otherwise."""
     if lying := [camera for camera in cameras if _is_exchanged(camera)]:
         lens, names = lying[0].lens or lying[0], [camera.image_name for camera in lying]
-        raise UserError("; ".join(turned(names, len(cameras), lying[0].file_size, (lens.width, lens.height))))
+        said = exchanged_sides(names, len(cameras), lying[0].file_size, (lens.width, lens.height))
+        raise UserError("; ".join(said))
     shapes = [(camera, camera.file_size, camera.lens or camera) for camera in cameras]
     others = [
         (camera.image_name, f"{size[0]} x {size[1]}, camera {shape.width} x {shape.height}")

@@ -15,9 +15,9 @@ from scene.readers.info import (
     SceneInfo,
     are_exchanged,
     camera_centers,
+    exchanged_sides,
     photo_size,
     standing_apart,
-    turned,
 )
 from scene.readers.tracks import enlargement
 from splatting.findings import Finding, Severity, fine
@@ -97,7 +97,7 @@ def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
     wrong = [(view, size) for view in views if are_exchanged(size := photo_size(view), (view.width, view.height))]
     if wrong:
         (view, size), names = wrong[0], [view.image_name for view, _ in wrong]
-        text, remedy = turned(names, len(views), size, (view.width, view.height))
+        text, remedy = exchanged_sides(names, len(views), size, (view.width, view.height))
         yield Finding(text, remedy, Severity.HOPELESS)
 
 
