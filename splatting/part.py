@@ -1,9 +1,10 @@
-"""The manual of parts: what a feature adds to a training, in one class, which lies in one folder.
+"""The manual of parts: what a feature adds to a training, in one class, which lies in one file.
 
-A part is a subclass of `Part` in splatting/parts/NAME/part.py, and a line in splatting/registry.py. The place of
-that line is the part's in the one order of all hooks. Outside of its folder nobody names it. Hooks are optional; those
-that a class does not override cost nothing. This module and every part.py import nothing heavy, as `train.py --help`
-reads them: the method itself lies in further modules of the folder, which hooks import.
+A part is a subclass of `Part` in splatting/parts/NAME.py, and a line in splatting/registry.py. The place of that line
+is the part's in the one order of all hooks. No other file names it. Hooks are optional; those that a class does not
+override cost nothing. This module and every NAME.py import nothing heavy, as doctor.py reads them where torch is
+missing: hooks import what they need. A long method lies in a second file beside it, NAME_*.py. Functions for commands
+and other parts are listed by `tools` of splatting/registry.py.
 
 A run (splatting/training/run.py), in the order in which it calls the hooks:
 
@@ -101,7 +102,7 @@ class Needs:
 class Part:
     """Base of all parts.
 
-    name: of its folder, and the key of its state.
+    name: of its module, and the key of its state.
     options: that it declares.
     switch: the option that brings the part in where it has another value than its default; empty: that named `name`.
     active: whether it takes part; `begin` may clear it where a scene has no use for the part, which then has no hooks.
@@ -111,7 +112,6 @@ class Part:
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
     waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
     own_end: whether its options let a training end before or after --iterations.
-    tools: functions that it has for other commands, in tools.py of its folder (`tools` of splatting/registry.py).
     """
 
     name: ClassVar[str] = ""
@@ -124,7 +124,6 @@ class Part:
     reads_model: ClassVar[bool] = True
     waits: ClassVar[bool] = False
     own_end: ClassVar[bool] = False
-    tools: ClassVar[tuple[str, ...]] = ()
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:

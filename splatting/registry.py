@@ -12,7 +12,7 @@ from splatting.part import Appearance, Part, Strategy
 if TYPE_CHECKING:
     from splatting.option import Option
 
-# Names of folders, with the reason for the place, where there is one.
+# Names of modules, with the reason for the place, where there is one.
 PARTS = (
     "more_photos",  # refuses a scene before anything trains on it
     "time_budget",
@@ -40,8 +40,8 @@ PARTS = (
 
 @cache
 def part_class(name: str) -> type[Part]:
-    """The class of the folder `name`: its name in capital words."""
-    return getattr(import_module(f"splatting.parts.{name}.part"), "".join(map(str.capitalize, name.split("_"))))
+    """The class of the module `name`: its name in capital words."""
+    return getattr(import_module(f"splatting.parts.{name}"), "".join(map(str.capitalize, name.split("_"))))
 
 
 def strategies() -> list[str]:
@@ -121,7 +121,7 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
 
 
 def tools(name: str) -> list[Callable]:
-    """The functions of a name that parts have for other commands than train.py, in their tools.py (`Part.tools`).
+    """The functions of a name that modules of parts have for others, which thus need no part.
 
     advise(scene, tracks): findings on a scene, and options of train.py that they speak for.
     beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
@@ -132,7 +132,6 @@ def tools(name: str) -> list[Callable]:
     pictures(model): files in a model folder that reports show, where they are there.
     summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.
     prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.
-    report_to(writer, iteration): what writes losses, images, scores and the model of a training report by one.
     """
-    having = [part for part in PARTS if name in part_class(part).tools]
-    return [getattr(import_module(f"splatting.parts.{part}.tools"), name) for part in having]
+    modules = [import_module(f"splatting.parts.{part}") for part in PARTS]
+    return [getattr(module, name) for module in modules if hasattr(module, name)]

@@ -32,8 +32,7 @@ import torch
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
-from splatting.parts.resume import part as resume
-from splatting.parts.tensorboard import tools as tensorboard
+from splatting.parts import resume, tensorboard
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic import make_blender_scene  # noqa: E402

@@ -15,7 +15,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
 from splatting.findings.training import late_reset
 from splatting.part import Needs
-from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
+from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule
 from splatting.training.schedule import Schedule
 from utils.general_utils import build_rotation
 

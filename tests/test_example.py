@@ -1,4 +1,4 @@
-"""The worked examples of parts (tests/parts/example): each is one folder and one line, and resumes to the byte."""
+"""The worked examples of parts (tests/parts/example): each is one file and one line, and resumes to the byte."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Rules of parts (splatting/part.py): nobody names one outside of its folder, and each can be deleted."""
+"""Rules of parts (splatting/part.py): nobody names one outside of its files, and each can be deleted."""
 
 import argparse
 import ast
@@ -7,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -51,11 +50,15 @@ def _options(name: str) -> set[str]:
     return {*part_class(name).options.by_name}
 
 
+def _own(name: str) -> list[Path]:
+    return [FOLDER / f"{name}.py", *FOLDER.glob(f"{name}_*.py")]
+
+
 def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: those outside of its folder, but the registry."""
+    """All Python files of the project that may not know a part: all but its own and the registry."""
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
     registry = ROOT / "splatting" / "registry.py"
-    yield from (path for path in found if FOLDER / name not in path.parents and path != registry)
+    yield from (path for path in found if path not in (registry, *_own(name)))
 
 
 @cache
@@ -71,9 +74,8 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
     typed = re.compile(rf"--({'|'.join(map(re.escape, sorted(options)))})\b")
     for node in _nodes(path):
         if isinstance(node, ast.ImportFrom):
-            found = f"splatting.parts.{name}" in f"{node.module}." or any(
-                f"{node.module}.{alias.name}" == f"splatting.parts.{name}" for alias in node.names
-            )
+            module = re.compile(rf"splatting\.parts\.{name}(_\w+)?(\.|$)")
+            found = any(module.match(f"{node.module}.{alias.name}") for alias in node.names)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found = node.value in options or typed.search(node.value)
         elif isinstance(node, ast.Attribute):
@@ -83,41 +85,40 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
             continue
         if found:
             said = getattr(node, "value", "") if isinstance(node, ast.Constant) else getattr(node, "attr", "an import")
-            yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its folder"
+            yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its files"
 
 
 @pytest.mark.parametrize("name", PARTS)
-def test_nobody_names_a_part_outside_of_its_folder(name):
+def test_nobody_names_a_part_outside_of_its_files(name):
     assert [line for path in _files(name) for line in _names_of(name, path)] == []
 
 
 def test_what_declares_parts_imports_nothing_heavy():
-    """As every command reads it for its options."""
+    """As doctor.py and convert.py read it where torch is missing."""
     code = "import sys, splatting.registry as r; list(map(r.part_class, r.PARTS)); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "scene", "arguments"} & {*done.stdout.split()}
 
 
-def test_parts_declare_their_tools():
-    known = {*re.findall(r"\b(\w+)\(", tools.__doc__)}
-    for name in PARTS:
-        path = FOLDER / name / "tools.py"
-        there = known & {*vars(import_module(f"splatting.parts.{name}.tools"))} if path.is_file() else set()
-        assert there == {*part_class(name).tools}, name
+def test_tools_are_functions_of_parts():
+    for name in re.findall(r"\b(\w+)\(", tools.__doc__):
+        of = [tool.__module__.split(".")[-1] for tool in tools(name)]
+        assert of and {*of} <= {*PARTS}, name
 
 
-# A program in which some parts are not there: neither their lines of the registry nor their folders.
+# A program in which some parts are not there: neither their lines of the registry nor their files.
 WITHOUT = """
 import sys
+from pathlib import Path
 import splatting.registry as registry
 hidden, *words = sys.argv[1:]
 hidden = hidden.split(",")
 registry.PARTS = tuple(name for name in registry.PARTS if name not in hidden)
-sys.modules |= {f"splatting.parts.{name}": None for name in hidden}
+files = [path for name in hidden for path in Path("splatting/parts").glob(f"{name}*.py")]
+sys.modules |= {f"splatting.parts.{path.stem}": None for path in files}
 """
 IMPORTED = """
 from importlib import import_module
-from pathlib import Path
 left_out = "integrations", *(f"splatting.parts.{name}" for name in hidden)
 for room in words:
     paths = Path(room).rglob("*.py") if Path(room).is_dir() else [Path(room)]

@@ -23,7 +23,7 @@ from splatting.evaluation.training_log import read_log
 from splatting.files.image_files import read_plane
 from splatting.files.json_files import read_json, write_json
 from splatting.files.plain_files import MOST
-from splatting.parts.time_budget.schedule_file import read_schedule
+from splatting.parts.time_budget_file import read_schedule
 from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 

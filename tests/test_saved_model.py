@@ -17,7 +17,7 @@ from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_ex
 from scene.saved_model import find_save, read_model
 from splatting.evaluation.training_log import read_log
 from splatting.host.start import typed_command
-from splatting.parts.filter_3d.smoothing import Smoothing
+from splatting.parts.filter_3d import Smoothing
 from splatting.training.iteration import Iteration
 from utils.system_utils import UserError
 

@@ -16,8 +16,8 @@ import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from scene.sleeping import Sleeping
-from splatting.parts.filter_3d import part as filter_3d
-from splatting.parts.robust_mask import residuals
+from splatting.parts import filter_3d
+from splatting.parts import robust_mask_residuals as residuals
 from splatting.training import loop, run
 from splatting.training.iteration import Iteration
 from splatting.training.steps import FasterSteps

@@ -13,7 +13,7 @@ from scene.sleeping import Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch
 from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts.spill.announcement import sentences
+from splatting.parts.spill import sentences
 from splatting.registry import part_class, strategy_part
 from splatting.training.iteration import ViewOrder
 from splatting.training.objective import LossWatch, Objective

@@ -2,7 +2,7 @@
 
 Options count steps of a schedule, whose last is --iterations: windows of densification, resets, learning rates, and
 when to test or save. A steady run takes each of them in one iteration. Another run is longer or shorter, and still goes
-through the whole schedule: by the clock, or as a file says (splatting/parts/time_budget).
+through the whole schedule: by the clock, or as a file says (splatting/parts/time_budget.py).
 """
 
 import math

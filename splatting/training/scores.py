@@ -14,7 +14,7 @@ from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from splatting.part import Part
-from splatting.registry import tools
+from splatting.training.events import Events
 from splatting.training.iteration import Iteration, Losses
 from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
 from utils.loss_utils import l1_loss
@@ -72,7 +72,7 @@ def training_report(
     more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
     Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, `beside_test` included.
     """
-    told = [report_to(tb_writer, iteration) for report_to in tools("report_to")] if tb_writer else []
+    told = [Events(tb_writer, iteration)] if tb_writer else []
     for events in told:
         events.losses(l1, loss, elapsed)
     if iteration not in testing_iterations:

@@ -18,7 +18,7 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 from fuzz import KINDS
-from splatting.parts.tensorboard import tools as tensorboard
+from splatting.parts import tensorboard
 from utils.system_utils import UserError
 
 MOST = 2 << 30  # bytes that a case may add to the memory in use

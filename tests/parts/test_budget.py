@@ -25,10 +25,9 @@ from splatting.deterministic.counter_rng import Stream
 from splatting.distributed.rows import WHOLE
 from splatting.findings.training import another_number
 from splatting.part import Strategy
-from splatting.parts.budget.error_scores import error_scores
-from splatting.parts.budget.part import Budget
-from splatting.parts.budget.rules import fade, split_in_two
-from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule
+from splatting.parts.budget import Budget
+from splatting.parts.budget_rules import error_scores, fade, split_in_two
+from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule
 from splatting.registry import part_class
 from splatting.training.objective import Objective
 from splatting.training.schedule import STEADY, Schedule

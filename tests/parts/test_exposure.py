@@ -20,7 +20,7 @@ from scene.gaussians.checkpoint import EXPOSURES, WRITTEN_BY, extra_state, load_
 from scene.gaussians.exposure import Exposures, read_exposures
 from scene.readers.info import exposure_names
 from splatting.evaluation.error_curve import read_curve
-from splatting.parts.exposure.half_images import train_on_all
+from splatting.parts.exposure import train_on_all
 from splatting.registry import states_in
 from utils.general_utils import get_expon_lr_func
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim

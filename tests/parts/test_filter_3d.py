@@ -15,7 +15,7 @@ from gaussian_renderer import render
 from scene import GaussianModel, Scene
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint, with_extra_state
 from scene.gaussians.filtered import filtered
-from splatting.parts.filter_3d.smoothing import filter_widths
+from splatting.parts.filter_3d import filter_widths
 from utils.system_utils import UserError
 
 ON = "--filter_3d", "--antialiasing"

@@ -8,7 +8,7 @@ import pytest
 from synthetic import make_colmap_scene
 from trainings import train_on
 
-from splatting.parts.more_photos.order import Added, added_order
+from splatting.parts.more_photos_order import Added, added_order
 from splatting.training.iteration import ViewOrder
 from splatting.training.run import Run
 from utils.system_utils import UserError

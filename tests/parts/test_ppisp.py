@@ -24,8 +24,8 @@ from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
-from splatting.parts.ppisp.appearance import NAME, PhotoAppearance, appearance_of, read_appearance
-from splatting.parts.ppisp.tools import exposures
+from splatting.parts.ppisp import exposures
+from splatting.parts.ppisp_appearance import NAME, PhotoAppearance, appearance_of, read_appearance
 from utils.system_utils import UserError
 
 SIDE = 20

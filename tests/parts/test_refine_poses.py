@@ -29,10 +29,9 @@ from splatting.demo.objects import demo_scene
 from splatting.demo.tracer import FISHEYE, ring_views
 from splatting.evaluation.plan import Run, SceneEntry
 from splatting.evaluation.results import read_run
-from splatting.parts.refine_poses import bounded_adam, refinement, tracked_poses
-from splatting.parts.refine_poses.bounded_adam import BoundedAdam
-from splatting.parts.refine_poses.pose_file import NAME, with_poses
-from splatting.parts.refine_poses.refinement import PoseRefinement
+from splatting.parts import refine_poses_steps as refinement
+from splatting.parts.refine_poses import NAME, with_poses
+from splatting.parts.refine_poses_steps import BoundedAdam, PoseRefinement
 from utils.graphics_utils import camera_center, world_to_camera
 from utils.system_utils import UserError
 
@@ -114,7 +113,7 @@ def test_a_pose_may_stay():
     noisy, near = _track(200, 1e-3), moved_pose(POSE, 1e-3 * TURN, 1.0)
     assert nearest_pose(near, noisy, 500.0, 1.0, BOUND) is near  # by a hundredth of the errors' size
     assert nearest_pose(moved_pose(POSE, 0.05 * TURN, 1.0), noisy, 500.0, 1.0, BOUND) is not near
-    tracked = tracked_poses.TrackedPoses([near], [noisy], [500.0], 1.0)
+    tracked = refinement.TrackedPoses([near], [noisy], [500.0], 1.0)
     assert not tracked.pulled(0, np.zeros(6)).any()  # it is held there
     assert tracked.pulled(0, TURN).any()
 
@@ -224,7 +223,7 @@ def test_what_all_cameras_could_do_together_is_taken_out(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     scene, poses = _refinement(tmp_path)
     cameras, before = scene.getTrainCameras(), _poses(scene)
-    monkeypatch.setattr(tracked_poses, "_ANCHOR", 0.0)
+    monkeypatch.setattr(refinement, "_ANCHOR", 0.0)
     monkeypatch.setattr(refinement, "_PASSES", 1)
     rng = np.random.default_rng(3)
     own = rng.normal(size=poses.twists.shape) * 1e-3
@@ -271,7 +270,7 @@ def test_the_gradient_of_a_twist(tmp_path):
 
 
 def test_bounded_adam_is_torchs(monkeypatch):
-    monkeypatch.setattr(bounded_adam, "BOUND", 10.0)
+    monkeypatch.setattr(refinement, "BOUND", 10.0)
     mine, rates = BoundedAdam(2), [0.1, 0.05, 0.02]
     value = torch.zeros(6, dtype=torch.float64, requires_grad=True)
     theirs = torch.optim.Adam([value], betas=(0.9, 0.99), eps=1e-12)
@@ -287,7 +286,7 @@ def test_bounded_adam_is_torchs(monkeypatch):
 def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
-    monkeypatch.setattr(tracked_poses, "_ANCHOR", 0.0)
+    monkeypatch.setattr(refinement, "_ANCHOR", 0.0)
     monkeypatch.setattr(refinement, "_PASSES", 1)
     poses.step(2, _gradient(poses, 2, np.array([1.0, -1, 1, -1, 1, -1])), 0)
     assert np.array_equal(np.sign(poses.twists[2]), [-1, 1, -1, 1, -1, 1]) and not poses.twists[[0, 1, 3]].any()

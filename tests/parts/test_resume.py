@@ -11,8 +11,8 @@ from trainings import train_on
 from arguments.launch import launch_options
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting.files.json_files import read_model_json
-from splatting.parts.resume import part as resume
-from splatting.parts.resume.end import finished
+from splatting.parts import resume
+from splatting.parts.resume import finished
 from splatting.training.folder import REPLACED, new_folder
 from utils.system_utils import UserError
 

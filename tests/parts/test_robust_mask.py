@@ -13,8 +13,8 @@ from trainings import trained
 
 from splatting.evaluation.renders import GAP, HEADER
 from splatting.evaluation.training_log import read_log
-from splatting.parts.robust_mask import residuals, written
-from splatting.parts.robust_mask.residuals import Residuals
+from splatting.parts import robust_mask_residuals as residuals
+from splatting.parts.robust_mask_residuals import Residuals
 from utils.system_utils import UserError
 
 ON = "--robust_mask", 0.3, "--test_iterations", -1, "--opacity_reset_interval", 3000
@@ -109,14 +109,14 @@ def test_a_training_shows_what_it_leaves_out(scene, tmp_path, monkeypatch):
     assert (off := trained(scene, tmp_path / "off", *ON[2:]))["ply"] != whole["ply"]
     lines = read_log(tmp_path / "whole" / "train_log.json")[-1]["lines"]
     (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]
-    files = [path for path in (tmp_path / "whole" / written.FOLDER).rglob("*.png")]
+    files = [path for path in (tmp_path / "whole" / residuals.FOLDER).rglob("*.png")]
     assert f"in {len(files)} of 14 photos" in said and files
-    with Image.open(tmp_path / "whole" / written.PICTURE) as picture:
+    with Image.open(tmp_path / "whole" / residuals.PICTURE) as picture:
         pixels = np.asarray(picture, int)
     wide = (picture.width - 3 * GAP) // 2
     left, right = pixels[HEADER:, GAP : GAP + wide], pixels[HEADER:, -GAP - wide : -GAP]
     assert 0.01 < (right < left - 20).any(2).mean() < 0.4  # the same photos, darker where pixels are left out
-    again = trained(scene, tmp_path / "again", "--masks", tmp_path / "whole" / written.FOLDER, *ON[2:])
+    again = trained(scene, tmp_path / "again", "--masks", tmp_path / "whole" / residuals.FOLDER, *ON[2:])
     assert again["ply"] != off["ply"]  # they are mask files
 
 
@@ -127,8 +127,8 @@ def test_masks_are_written_below_the_model_folder(tmp_path, above, monkeypatch):
     cameras = [SimpleNamespace(image_name=name) for name in names]
     masks = SimpleNamespace(cameras=cameras, counted=lambda camera: torch.ones(1, 4, 4))
     model = tmp_path / "model" / "of" / "it"
-    monkeypatch.setattr(written, "_draw", lambda *_: None)
-    written.write_masks(masks, model, str(tmp_path / "scene"), torch.zeros(3))
+    monkeypatch.setattr(residuals, "_draw", lambda *_: None)
+    residuals.write_masks(masks, model, str(tmp_path / "scene"), torch.zeros(3))
     found = [path.relative_to(model).as_posix() for path in tmp_path.rglob("*.png")]
     assert sorted(found) == ["robust_masks/left/1.png.png", "robust_masks/right/1.png.png"]
 

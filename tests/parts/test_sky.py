@@ -23,10 +23,9 @@ from splatting.demo.objects import Box, Thing, demo_scene
 from splatting.demo.tracer import ring_views, shade, trace
 from splatting.files.json_files import read_model_json
 from splatting.findings.model import check_model
-from splatting.parts.sky.directions import FEWEST
-from splatting.parts.sky.shell import Shell, find_sky
-from splatting.parts.time_budget.paced import Block, Decided
-from splatting.parts.time_budget.schedule_file import write_schedule
+from splatting.parts.sky_shell import FEWEST, Shell, find_sky
+from splatting.parts.time_budget_file import write_schedule
+from splatting.parts.time_budget_schedule import Block, Decided
 from utils.system_utils import UserError
 
 ON = "--sky", "auto", "--densify_grad_threshold", 1e-5

@@ -18,7 +18,6 @@ from scene.readers.tracks import read_tracks
 from scene.scene import Scene
 from splatting.files.image_files import read_plane
 from splatting.files.json_files import read_json
-from splatting.parts.sparse_depth import points
 
 FISHEYE = (*BROWN[:4], 0.02, -0.01, 0.003, 0.001)
 
@@ -115,5 +114,5 @@ def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch
 
 
 def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(points, "read_tracks", lambda *_: pytest.fail("tracks are read"))
+    monkeypatch.setattr("scene.readers.tracks.read_tracks", lambda *_: pytest.fail("tracks are read"))
     trained(scene, tmp_path / "off", "--test_iterations", -1)

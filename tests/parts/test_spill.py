@@ -32,9 +32,9 @@ from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
 from splatting.findings import resources
 from splatting.findings.resources import training_bytes
-from splatting.parts.spill import gpu_memory, torch_limit
-from splatting.parts.spill.announcement import sentences
-from splatting.parts.spill.gpu_memory import GpuMemory, resident_rows, spillable_bytes
+from splatting.parts import spill_memory as gpu_memory
+from splatting.parts.spill import sentences
+from splatting.parts.spill_memory import GpuMemory, resident_rows, spillable_bytes
 from splatting.registry import part_class
 from splatting.training import run
 from utils.system_utils import UserError
@@ -123,7 +123,7 @@ def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (total, total))
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
     monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: 1.0)
-    monkeypatch.setattr(torch_limit, "_before", [])
+    monkeypatch.setattr(gpu_memory, "_before", [])
     monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
     memory = GpuMemory(1.0, model(50), False, torch.device("cuda"))
     memory._limit_torch(800)
@@ -139,15 +139,15 @@ def test_a_training_leaves_torch_what_it_had(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: share[-1])
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", share.append)
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
-    monkeypatch.setattr(torch_limit, "_before", [])
+    monkeypatch.setattr(gpu_memory, "_before", [])
     part = part_class("spill")()
     part.ended(None)
     assert share == [0.4]
     for limit in (100, 200):
-        torch_limit.limit_torch(limit, torch.device("cuda"))
+        gpu_memory.limit_torch(limit, torch.device("cuda"))
     part.ended(UserError("full"))
     assert share == [0.4, 0.1, 0.2, 0.4]
-    torch_limit.limit_torch(300, torch.device("cuda"))
+    gpu_memory.limit_torch(300, torch.device("cuda"))
     opt = SimpleNamespace(gpu_memory=0.0, absgrad=False)
     part.check(SimpleNamespace(gaussians=model(50), opt=opt, device=torch.device("cpu")), None)
     assert share == [0.4, 0.1, 0.2, 0.4, 0.3, 0.4]

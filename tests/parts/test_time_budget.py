@@ -15,9 +15,9 @@ from trainings import before_steps, train_on
 
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.training_log import Stopwatch
-from splatting.parts.time_budget.paced import Block, Decided, DecidedSchedule, TimeBudget
-from splatting.parts.time_budget.schedule_file import read_schedule, schedule_of, write_schedule
-from splatting.parts.time_budget.sizes import Sizes
+from splatting.parts.time_budget import Sizes
+from splatting.parts.time_budget_file import read_schedule, schedule_of, write_schedule
+from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule, TimeBudget
 from splatting.registry import strategy_part
 from splatting.training.iteration import Iteration
 from splatting.training.log import ProgressBar

@@ -20,7 +20,7 @@ from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
 from scene.saved_model import read_model  # noqa: E402
-from splatting.parts.viewer import training_page as observed  # noqa: E402
+from splatting.parts import viewer_page as observed  # noqa: E402
 from splatting.viewer.page import serve  # noqa: E402
 
 ITERATIONS = 120

@@ -1,6 +1,6 @@
 #pragma once
 // The chain rule of a step whose opacities and scales in the Scene are functions of the parameters that it changes, as
-// the 3D smoothing filter's are (splatting/parts/filter_3d/smoothing.py).
+// the 3D smoothing filter's are (splatting/parts/filter_3d.py).
 #include <cstdint>
 
 #include "gs/rounded.h"

@@ -1,0 +1,121 @@
+"""The limit of what a training takes of a GPU (--gpu_memory): SH bands that do not fit lie in the host's memory.
+
+The limit must begin before the first rows exist, and the most rows of a checkpoint may not fit on the GPU at all. So
+the part gives the model its room in `check`, while the model is empty, not in `begin`.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from splatting.option import Option, within
+from splatting.part import Error, Options, Part, fill
+
+if TYPE_CHECKING:
+    import argparse
+
+    from splatting.parts.spill_memory import GpuMemory
+    from splatting.training.iteration import Iteration
+
+_BUS = 40e9  # bytes a second that kernels read or write in the host's memory
+_SLOW = 10.0  # milliseconds a step, from which on the bus is named
+
+
+class Spill(Part):
+    """Gives the model its room, says what of it lies on the host, and brings back what fits after a change.
+
+    It is in every training: without the option, a limit begins where a GPU is too small.
+    """
+
+    name = "spill"
+    switch = "gpu_memory"
+    # fmt: off
+    options = Options(optimisation=(
+        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
+            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
+                 "not fit are kept in the host's memory; slower, with the same result"),
+    ))
+    # fmt: on
+
+    @classmethod
+    def wanted(cls, given: "argparse.Namespace") -> bool:
+        return True
+
+    def check(self, run: Any, state: Any) -> None:
+        from splatting.parts.spill_memory import GpuMemory, release_torch
+        from splatting.registry import part_class, strategies
+
+        release_torch()  # from the limit of a training that was refused after this
+        self._model = run.gaussians
+        absolute = any(part_class(name).takes_absolute(run.opt) for name in strategies())
+        fill(self._model, "room", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
+
+    def ready(self, run: Any) -> None:
+        self._model.room.expect(-(-run.density.max_gaussians // run.group.size), run.scene)
+
+    def opened(self, run: Any) -> None:
+        announce(run, self._model.room)
+        self._model.room.settle(self._model)
+
+    def after_change(self, at: "Iteration") -> None:
+        self._model.room.settle(self._model)
+
+    def ended(self, error: Error) -> None:
+        from splatting.parts.spill_memory import release_torch
+
+        release_torch()
+
+
+def announce(run: Any, memory: "GpuMemory") -> None:
+    """Say what lies in the host's memory, now or once there are as many Gaussians as there may be, and what it costs.
+
+    Warn if the host has too little for what is expected.
+    """
+    from scene import sleeping
+    from scene.sampling_rate import share_of
+    from splatting.findings.resources import expected_count
+
+    now, most, size = run.gaussians.gaussian_count, run.density.max_gaussians, run.group.size
+    later = expected_count(most, now)
+    if far := memory.host_bytes(-(-later // size)):
+        _announce_host(run.scene.images, far, f"{later:,} Gaussians", size)
+    count = -(-max(now, most) // size)
+    if memory.host_bytes(count):
+        share = share_of(run.scene, run.device)
+        dense = run.sleeping is None and run.opt.optimizer_type == "default"
+        same = run.sleeping is None or share < sleeping.MOST_SHARE  # blocks would sleep in any case
+        print("\n".join(sentences(memory, count, 1.0 if dense else share, same)))
+
+
+def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
+    """Print what the host has to hold, besides photos there; warn if it does not fit."""
+    import torch
+
+    from splatting.findings.resources import REMEDY, announce_device, warn_of
+    from splatting.host.memory import gib
+
+    host = torch.device("cpu")
+    pictures = images.planned_bytes if images.keep_on == host else 0
+    each = f" for each of {size} processes" if size > 1 else ""
+    room = announce_device(host, f"{gib(needed)} of {what}{each}", pictures, pictures + needed)
+    if room < needed:
+        warn_of(host, what, f"set a lower --max_num_splats, or {REMEDY}")
+
+
+def sentences(memory: "GpuMemory", count: int, seen: float, same: bool) -> list[str]:
+    """What to say before a training of so many Gaussians, of which some are spilled.
+
+    seen: the part of them that a step concerns. same: whether the files do not depend on that.
+    """
+    from splatting.host.memory import gib
+
+    spilled = memory.host_bytes(count)
+    said = [
+        f"{gib(spilled)} of {count:,} Gaussians are kept in the host's memory, as all of them need more than "
+        f"{gib(memory.limit)} of the GPU's; the saved files are the same" + ("" if same else " up to rounding")
+    ]
+    milliseconds = 1e3 * 2 * spilled * seen / _BUS
+    if milliseconds > _SLOW:
+        said.append(
+            f"transfers from and to that memory limit the speed to about {milliseconds:.0f} ms a step, which updates "
+            f"{seen:.0%} of the Gaussians"
+        )
+    return said
