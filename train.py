@@ -20,6 +20,7 @@ from arguments.launch import launch_options, training_parser
 from scene.readers.scene_folder import is_scene
 from splatting.registry import check_together, chosen, tools
 from splatting.training.agreement import agree_on_options
+from splatting.training.events import summary_writer
 from splatting.training.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
 from splatting.training.loop import run_training, standard_observers
 from splatting.training.run import Run
@@ -82,7 +83,7 @@ def prepare_output_and_logger(args: argparse.Namespace, **entries: Any) -> Any |
     mkdir_p(args.model_path)
     write_cfg_args(args.model_path, args)
     write_model_json(args.model_path, args, **entries)
-    return next((writer(args.model_path) for writer in tools("summary_writer")), None)
+    return summary_writer(args.model_path)
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:

@@ -19,7 +19,6 @@ begins, due, measured, stepped, ended
              What observers see. The core's own (splatting/training/loop.py) are parts without a name.
 changes      Asked in each iteration: whether rows, sizes or what is drawn will change in it.
 after_step   The optimiser has taken its step.
-after_change The same, where rows, the SH degree or sizes have changed.
 records      A record of the log is written, or a point of the curve.
 state        A checkpoint is written. It keeps the state by the part's name, and gives it back to `begin`.
 facts        model.json is written, when the training begins and with the last save.
@@ -89,52 +88,51 @@ class Needs:
         of no terms then, so `measured` finds none in `losses.terms`.
     ranks: it works with several processes.
     files: it reads files of the scene besides photos.
-    bright: renders must not turn dark, so strategies reset no opacities unless they are told how often.
+    resets: strategies may reset opacities, so that renders turn dark, though nobody has told them how often.
     """
 
     depth: bool = False
     captured: bool = False
     ranks: bool = True
     files: bool = False
-    bright: bool = False
+    resets: bool = True
 
 
 class Part:
     """Base of all parts.
 
-    name: of its module, and the key of its state.
+    name: of its module, the key of its state, and the option that brings it in by another value than its default.
     options: that it declares.
-    switch: the option that brings the part in where it has another value than its default; empty: that named `name`.
     active: whether it takes part; `begin` may clear it where a scene has no use for the part, which then has no hooks.
-    joins: whether its state in a checkpoint brings the part in where no option asks for it.
+    by_state: whether its state in a checkpoint brings the part in where no option asks for it.
     needs: what it asks of the steps.
     against: what it does not work with, `option` or `option=value`, and the rest of a sentence: why, and what to do.
     reads_model: whether it reads the model in iterations that are due for it; sleeping blocks then catch up first.
-    waits: whether it may let the training wait. It is told last, when all else of an iteration is done and written.
-    own_end: whether its options let a training end before or after --iterations.
+    told_last: as it may let the training wait: when all else of an iteration is done and written.
+    ends_by: its options that let a training end before or after --iterations, and whether the same ones train a
+    finished training further.
     """
 
     name: ClassVar[str] = ""
     options: ClassVar[Options] = Options()
-    switch: ClassVar[str] = ""
     active = True
-    joins: ClassVar[bool] = False
+    by_state: ClassVar[bool] = False
     needs: ClassVar[Needs] = Needs()
     against: ClassVar[dict[str, str]] = {}
     reads_model: ClassVar[bool] = True
-    waits: ClassVar[bool] = False
-    own_end: ClassVar[bool] = False
+    told_last: ClassVar[bool] = False
+    ends_by: ClassVar[dict[str, bool]] = {}
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
         """Whether the options ask for the part."""
-        option = cls.options.by_name[cls.switch or cls.name]
+        option = cls.options.by_name[cls.name]
         return getattr(given, option.name, option.default) != option.default
 
     @classmethod
     def asked_by(cls, given: argparse.Namespace) -> str:
         """The option that asks for the part, as it is typed."""
-        return f"--{cls.switch or cls.name}"
+        return f"--{cls.name}"
 
     @classmethod
     def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
@@ -184,10 +182,10 @@ class Part:
         return False
 
     def after_step(self, at: "Iteration") -> None:
-        """The optimiser has taken the iteration's step, so not in the last iteration, which takes none."""
+        """The optimiser has taken the iteration's step, so not in the last iteration, which takes none.
 
-    def after_change(self, at: "Iteration") -> None:
-        """Rows, the SH degree or sizes of views have changed, after `after_step`."""
+        at.changes: rows, the SH degree or sizes of views have changed, or will by parts that follow.
+        """
 
     def records(self) -> dict[str, float]:
         """Numbers for a record of the log, asked once all parts are told of the iteration's losses."""

@@ -18,7 +18,7 @@ PARTS = (
     "time_budget",
     "exposure",  # adds training views before anything moves them
     "refine_poses",  # its cameras stand right before anything asks where they are
-    "depth_maps",
+    "depths",
     "curve",  # its scores are those of the model that is saved in the same iteration
     "robust_mask",
     "adc",  # the first strategy is the default
@@ -96,12 +96,12 @@ def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:
-    """The parts that options ask for, and those that join where a checkpoint has their state, in their order.
+    """The parts that options ask for, and those that a checkpoint brings by their state, in their order.
 
     given: options of all groups. states: names of parts that a checkpoint has states of.
     """
     kinds = map(part_class, PARTS)
-    return [kind() for kind in kinds if kind.wanted(given) or (kind.joins and kind.name in states)]
+    return [kind() for kind in kinds if kind.wanted(given) or (kind.by_state and kind.name in states)]
 
 
 def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
@@ -128,9 +128,7 @@ def tools(name: str) -> list[Callable]:
     advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
     drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
     for_few_iterations(count): remedies.
-    continues(opt): whether the same options train a finished training further, None: --iterations says so.
     pictures(model): files in a model folder that reports show, where they are there.
-    summary_writer(folder): TensorBoard's, as `train.prepare_output_and_logger` returns it, or None.
     prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.
     """
     modules = [import_module(f"splatting.parts.{part}") for part in PARTS]

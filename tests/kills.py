@@ -32,7 +32,7 @@ import torch
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
-from splatting.parts import resume, tensorboard
+from splatting.parts import resume
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic import make_blender_scene  # noqa: E402
@@ -131,7 +131,7 @@ def _start(scene: Path, out: Path, words: Sequence[str], prepare: Callable[[], A
         prepare()
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         os.dup2(os.open(out.parent / "errors", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
-        tensorboard.summary_writer = lambda folder: None
+        train.summary_writer = lambda folder: None
         torch.set_num_threads(1)
         train.main(["-s", str(scene), "-m", str(out), *OPTIONS, *words])
         status = 0

@@ -262,9 +262,9 @@ def test_a_run_by_the_clock_recovers_from_no_reset_that_it_leaves_out():
     assert not any(control.resets(t) or control.recovers(t) for t in range(1, 3000))
 
 
-@pytest.mark.parametrize(("bright", "interval", "resets"), [(False, 3000, 5), (True, 3000, 0), (True, 2500, 6)])
-def test_a_part_may_want_no_resets(bright, interval, resets):
-    parts = [SimpleNamespace(needs=Needs(bright=bright))]
+@pytest.mark.parametrize(("allowed", "interval", "resets"), [(True, 3000, 5), (False, 3000, 0), (False, 2500, 6)])
+def test_a_part_may_want_no_resets(allowed, interval, resets):
+    parts = [SimpleNamespace(needs=Needs(resets=allowed))]
     opt = options(opacity_reset_interval=interval)
     control = begun("adc", model(4), opt, Schedule(30_000), white=True, parts=parts)
     assert sum(control.resets(t) for t in range(1, 30_000)) == resets

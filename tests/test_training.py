@@ -211,7 +211,7 @@ def test_the_output_folder_is_made_for_other_code_too(tmp_path, monkeypatch, opt
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OAR_JOB_ID", "a_long_job_id")
     writer = object()
-    monkeypatch.setattr("splatting.parts.tensorboard.summary_writer", lambda folder: writer)
+    monkeypatch.setattr("train.summary_writer", lambda folder: writer)
     args = argparse.Namespace(sh_degree=3, source_path="/s", model_path="", images="images", resolution=-1,
                               white_background=True, data_device="cuda", eval=True, **options)  # fmt: skip
     assert train.prepare_output_and_logger(args) is writer

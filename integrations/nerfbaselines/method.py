@@ -36,12 +36,12 @@ INTERVAL = 100  # iterations between losses that are told: reading one waits for
 _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test_iterations=-1", "--save_iterations=-1")
 _PARTS = [part_class(name) for name in PARTS]
 _OF_FILES = ("appearance", "init_ply", "masks", *(kind.flag for kind in appearances() if kind.flag))
-_OF_FILES += tuple(part.switch or part.name for part in _PARTS if part.needs.files)
+_OF_FILES += tuple(part.name for part in _PARTS if part.needs.files)
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(
     ("advise", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "keep_unseen", "prune_sh",
-     *(name for part in _PARTS if part.waits for name in part.options.by_name))
+     *(name for part in _PARTS if part.told_last for name in part.options.by_name))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")

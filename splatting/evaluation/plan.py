@@ -35,10 +35,7 @@ RESERVED = {"figures"}  # folders of the report, next to the models
 _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.options if option.name == "iterations")
 
 RECORD = "full_eval.json"  # in a model folder: finished stages with their inputs, machine and seconds
-_OF_PARTS = [part_class(name) for name in PARTS if part_class(name).own_end]
-ENDING = [
-    option.name for part in _OF_PARTS for option in part.options.optimisation
-]  # they end a training by themselves
+ENDING = [option for name in PARTS for option in part_class(name).ends_by]  # they end a training by themselves
 
 
 @dataclass(frozen=True)

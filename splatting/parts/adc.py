@@ -41,12 +41,13 @@ class Adc(Strategy):
         return opt.absgrad
 
     def begin(self, run: Any, state: Any) -> None:
-        """Where a part needs bright renders, opacities are reset at an interval that is given, or never."""
+        """Where a part allows no resets, opacities are reset at an interval that is given, or never."""
         from scene.gaussians import density_rules
 
         super().begin(run, state)
         opt, self._white_background = run.opt, run.dataset.white_background
-        if any(part.needs.bright for part in run.parts) and opt.opacity_reset_interval == density_rules.USUAL_RESETS:
+        usual = opt.opacity_reset_interval == density_rules.USUAL_RESETS
+        if usual and not all(part.needs.resets for part in run.parts):
             opt, self._white_background = copy.copy(opt), False
             opt.opacity_reset_interval = sys.maxsize
         self._gaussians, self._opt, self._rules = run.gaussians, opt, density_rules

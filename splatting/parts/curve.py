@@ -19,7 +19,6 @@ class Curve(Part):
     """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
 
     name = "curve"
-    switch = "no_curve"
     # fmt: off
     options = Options(launch=(
         Option("no_curve", False, origin="ours", topic="output",

@@ -56,8 +56,9 @@ class Filter3d(Part):
     def changes(self, iteration: int) -> bool:
         return iteration % INTERVAL == 0
 
-    def after_change(self, at: "Iteration") -> None:
-        self._update()
+    def after_step(self, at: "Iteration") -> None:
+        if at.changes:
+            self._update()
 
     def state(self) -> Any:
         model = self._run.gaussians

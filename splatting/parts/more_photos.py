@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.part import Options, Part, fill
+from splatting.part import Part, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -16,16 +16,11 @@ class MorePhotos(Part):
     """
 
     name = "more_photos"
-    options = Options()
-    joins = True
+    by_state = True  # also where torchrun restarts a training, which names no checkpoint
 
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:
         return bool(getattr(given, "start_checkpoint", None))
-
-    @classmethod
-    def asked_by(cls, given: "argparse.Namespace") -> str:
-        return "--start_checkpoint"
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.parts.more_photos_order import Added, added_order, new_photos

@@ -32,7 +32,7 @@ class Ppisp(Appearance):
         "exposure and white balance of each photo, vignetting and response of each camera, with the test photos held "
         "out, and without resets of opacities at their usual interval"
     )
-    needs = Needs(captured=True, bright=True)
+    needs = Needs(captured=True, resets=False)
 
     def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
         from scene.readers.info import names_of_photos

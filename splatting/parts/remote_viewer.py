@@ -32,7 +32,7 @@ class RemoteViewer(Part):
         Option("disable_viewer", False, called=True, help="open no port for the remote viewer", topic="viewers"),
     ))
     # fmt: on
-    waits = True
+    told_last = True
     _asked = False
 
     @classmethod

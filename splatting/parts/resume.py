@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from splatting.files.json_files import MODEL_JSON, read_model_json
 from splatting.option import MOST_NEEDED, Option
 from splatting.part import Error, Options, Part
-from splatting.registry import tools
+from splatting.registry import PARTS, part_class
 from splatting.training.schedule import STEADY
 from utils.system_utils import UserError
 
@@ -37,7 +37,7 @@ class Resume(Part):
     """With --resume, writes a checkpoint from time to time. Leaves one at the end, and notes that it was reached."""
 
     name = "resume"
-    waits = True  # after the checkpoints that were asked for
+    told_last = True  # after the checkpoints that were asked for
     # fmt: off
     options = Options(launch=(
         Option("resume", False, origin="ours", topic=MOST_NEEDED,
@@ -174,7 +174,8 @@ def prepare(dataset: "argparse.Namespace", opt: "argparse.Namespace", launch: "a
     folder = dataset.model_path or folder_of(launch.start_checkpoint)
     if not folder:
         raise UserError("--resume needs -m, the folder whose training it resumes or starts")
-    asked = next((found for ask in tools("continues") if (found := ask(opt)) is not None), None)
+    ends = {name: further for part in PARTS for name, further in part_class(part).ends_by.items()}
+    asked = next((further for name, further in ends.items() if getattr(opt, name)), None)  # None: by --iterations
     if end := finished(folder):
         launch.start_checkpoint = str(end.checkpoint)
         return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)

@@ -26,7 +26,7 @@ class Sky(Part):
                  "off: add none. Trains in one process, with --strategy adc or budget"),
     ))
     # fmt: on
-    joins = True
+    by_state = True
     needs = Needs(depth=True, ranks=False)
     against = {"strategy=mcmc": "which relocates large Gaussians; use adc or budget"}
     shell = None
@@ -49,8 +49,9 @@ class Sky(Part):
         points = self.shell.at(at.camera, self._run.scene)
         return {"sky": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
 
-    def after_change(self, at: "Iteration") -> None:
-        self.shell.hold(self._run.gaussians)
+    def after_step(self, at: "Iteration") -> None:
+        if at.changes:
+            self.shell.hold(self._run.gaussians)
 
     def state(self) -> dict[str, Any]:
         return self.shell.captured()

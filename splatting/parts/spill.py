@@ -26,7 +26,6 @@ class Spill(Part):
     """
 
     name = "spill"
-    switch = "gpu_memory"
     # fmt: off
     options = Options(optimisation=(
         Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
@@ -55,8 +54,9 @@ class Spill(Part):
         announce(run, self._model.room)
         self._model.room.settle(self._model)
 
-    def after_change(self, at: "Iteration") -> None:
-        self._model.room.settle(self._model)
+    def after_step(self, at: "Iteration") -> None:
+        if at.changes:
+            self._model.room.settle(self._model)
 
     def ended(self, error: Error) -> None:
         from splatting.parts.spill_memory import release_torch

@@ -40,7 +40,7 @@ class TimeBudget(Part):
     ))
     # fmt: on
     _iteration = 0  # of a run; a scene without one saves no schedule
-    own_end = True
+    ends_by = {"time_budget": True, "schedule": False}
 
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:
@@ -181,8 +181,3 @@ def smaller(camera: "View", factor: float) -> tuple[int, int]:
 def for_few_iterations(count: int) -> str:
     """Options by which so many iterations go through the whole schedule."""
     return f"--schedule {count} in place of --iterations {count}"
-
-
-def continues(opt: "argparse.Namespace") -> bool | None:
-    """Whether the same options train a finished training further, None: --iterations says so."""
-    return bool(opt.time_budget) if opt.time_budget or opt.schedule else None

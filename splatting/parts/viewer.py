@@ -34,7 +34,7 @@ class Viewer(Part):
     ))
     # fmt: on
     needs = Needs(ranks=False)
-    waits = True
+    told_last = True
 
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:

@@ -104,13 +104,13 @@ def standard_observers(run: Run) -> list[Part]:
         run.watch,  # first: observers that write rely on all losses so far being finite
         *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
-        *(part for part in run.parts if not part.waits),
+        *(part for part in run.parts if not part.told_last),
         Scores(run),
         Saves(run),  # before the model changes
         Records(run),  # after all that add to the iteration's record
         Summary(run),  # after all that say something at the end
         run.checkpoints,  # writes the whole state after the step
-        *(part for part in run.parts if part.waits),
+        *(part for part in run.parts if part.told_last),
     ]
 
 

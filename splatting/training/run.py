@@ -355,9 +355,6 @@ class Run:
         """What follows the optimiser's step."""
         for after_step in self.each("after_step"):
             after_step(step)
-        if step.changes:
-            for after_change in self.each("after_change"):
-                after_change(step)
 
     def flushed_view(self) -> AbstractContextManager:
         """Within it, others may read the model."""

@@ -17,8 +17,8 @@ from pathlib import Path
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
+import train
 from fuzz import KINDS
-from splatting.parts import tensorboard
 from utils.system_utils import UserError
 
 MOST = 2 << 30  # bytes that a case may add to the memory in use
@@ -30,7 +30,7 @@ def main() -> None:
     seed, folder = sys.argv[1], Path(sys.argv[2])
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)  # what is said goes to the log
-    tensorboard.summary_writer = lambda folder: None  # its threads would pile up
+    train.summary_writer = lambda folder: None  # its threads would pile up
     torch.set_num_threads(1)
     kinds = {}
     for kind, place in KINDS.items():

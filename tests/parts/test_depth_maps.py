@@ -35,7 +35,7 @@ from scene.readers.depth_maps import (
 )
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
 from scene.readers.info import CameraInfo, SceneInfo
-from splatting.parts.depth_maps import depth_loss
+from splatting.parts.depths import depth_loss
 from utils import make_depth_scale
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError

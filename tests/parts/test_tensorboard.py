@@ -13,8 +13,8 @@ from PIL import Image
 import train
 from splatting.evaluation.peer_curve import read_scalars
 from splatting.findings import environment
-from splatting.parts.tensorboard import EventWriter
 from splatting.training import events
+from splatting.training.events import EventWriter
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:

@@ -15,11 +15,10 @@ if TYPE_CHECKING:
     from splatting.training.iteration import Iteration, Term
 
 
-class DepthMaps(Part):
+class Depths(Part):
     """Finds the maps of the training photos, and adds their loss for views whose map is reliable."""
 
-    name = "depth_maps"
-    switch = "depths"
+    name = "depths"
     # fmt: off
     options = Options(
         model=(
