@@ -30,7 +30,6 @@ PARTS = (
     "filter_3d",  # after all that moves rows
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
-    "upright",  # only keeps a record
     "tensorboard",  # from here on, those that only watch
     "resume",  # before all that may let the training wait
     "remote_viewer",

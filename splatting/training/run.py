@@ -27,6 +27,7 @@ from splatting.distributed.ranks import ranks
 from splatting.evaluation.error_curve import Row
 from splatting.evaluation.training_log import Stopwatch, TrainingLog
 from splatting.files.json_files import SCHEDULE
+from splatting.files.similarity import ENTRY, read_orientation
 from splatting.findings.resources import announce_memory
 from splatting.findings.scene import check_scene
 from splatting.findings.training import check_alone, check_native, warnings_of
@@ -86,6 +87,7 @@ class Run:
         self.schedule = Schedule(opt.iterations)
         self._fill_slots()
         states = self._choose_parts(capture)
+        self._orientation = read_orientation(Path(dataset.source_path))
         if self.schedule.is_over(self.first_iteration):
             raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
         self.scene, first = self._read_scene()
@@ -214,8 +216,9 @@ class Run:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What parts keep in model.json."""
-        return {name: fact for facts in self.each("facts") for name, fact in facts().items()}
+        """What parts keep in model.json, and where the scene stands upright, for exports (convert.py --orient)."""
+        found = {name: fact for facts in self.each("facts") for name, fact in facts().items()}
+        return found | ({ENTRY: self._orientation} if self._orientation else {})
 
     def begin(self, writer: Any = None, report: Callable | None = None) -> None:
         """Write the inputs into the output folder, print the memory estimate, and start the clock.
