@@ -1,6 +1,7 @@
 """The backward that steps the Gaussians itself, against gradients in memory, `adam_` and `observe_`: equal bytes."""
 
 import math
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 
 import pytest
@@ -47,15 +48,6 @@ class State:
     def tensors(self) -> list[Tensor]:
         averages = [t for tensors in self.averages for t in tensors]
         return [*self.values.values(), *averages, *self.counters, *self.statistics, self.stopped]
-
-    def copy(self) -> "State":
-        return State(
-            {name: t.clone() for name, t in self.values.items()},
-            [[t.clone() for t in tensors] for tensors in self.averages],
-            [t.clone() for t in self.counters],
-            [t.clone() for t in self.statistics],
-            self.stopped.clone(),
-        )
 
 
 @dataclass
@@ -213,8 +205,7 @@ CASES = {
 # No Gaussian, one, and more than vectors of 16 and blocks of 128 hold, with bands of harmonics that none reads.
 CASES |= {
     f"{count} of {bands} bands": Case(degree=degree, count=count, bands=bands)
-    for count in (0, 1, 31, 129)
-    for degree, bands in enumerate((0, 3, 15))
+    for count, degree, bands in [(0, 1, 3), (1, 2, 15), (31, 0, 0), (129, 1, 3)]
 }
 
 
@@ -240,7 +231,7 @@ def test_every_form_has_the_bytes_of_the_plain_step(case, device, dtype):
     if case.lens:  # of which there are no gradient rows
         steps.remove(step_from_rows)
     start, camera = start_and_camera(case, device, dtype)
-    forms = {step: start.copy() for step in steps}
+    forms = {step: deepcopy(start) for step in steps}
     for iteration in (1, 2, 3):
         for step, state in forms.items():
             step(state, camera, case, iteration)

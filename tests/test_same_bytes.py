@@ -6,6 +6,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 
 import pytest
@@ -145,7 +146,7 @@ def _gaussian_step(device: str, dtype: torch.dtype) -> Callable[[], Results]:
     start, camera = start_and_camera(case, device, dtype)
 
     def step() -> Results:
-        state = start.copy()
+        state = deepcopy(start)
         step_fused(state, camera, case, 1)
         return state.tensors()
 
