@@ -6,7 +6,6 @@ import pytest
 import torch
 from diff_gaussian_rasterization import reference
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.camera import camera_numbers
 from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.scene import draw, scene_arguments
@@ -165,19 +164,6 @@ def test_other_gradients_keep_their_bytes(device, dtype):
     assert view.grad.isfinite().all() and view.grad[:, :3].all() and not view.grad[:, 3].any()
     for name, values in plain.items():
         assert torch.equal(values, asked[name]), name
-
-
-def test_nothing_is_computed_unless_asked(monkeypatch):
-    parameters, size = few()
-    camera, inputs = settings(**size), {name: t.clone().requires_grad_() for name, t in parameters.items()}
-    arguments = scene_arguments(Gaussians(**inputs), camera, True)
-    assert camera_numbers(arguments, camera) is None
-    calls = []
-    monkeypatch.setattr(OPERATORS, "camera_vjp", lambda *_: calls.append(_) or pytest.fail("was not asked for"))
-    render(inputs, camera).color.sum().backward()
-    with torch.no_grad():
-        assert camera_numbers(arguments, camera._replace(campos=camera.campos.requires_grad_())) is None
-    assert not calls
 
 
 def test_no_gaussian_is_seen():

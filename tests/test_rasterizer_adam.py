@@ -3,7 +3,7 @@
 import pytest
 import torch
 from diff_gaussian_rasterization import optim
-from rasterizer_tools import adam
+from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, adam
 from torch import Tensor
 
 BETAS, EPS, RATE = (0.9, 0.999), 1e-15, 0.01
@@ -38,19 +38,22 @@ def gradients_of(shape: tuple[int, ...], steps: int, dtype: torch.dtype) -> list
 
 @SPARSE
 @pytest.mark.parametrize("shape", [(41, 5, 3), (30, 17)])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
-def test_fifty_steps_are_the_formulas(dtype, shape, sparse):
+@BOTH_AND_GPU
+def test_fifty_steps_are_the_formulas(device, dtype, shape, sparse):
     generator = torch.Generator().manual_seed(1)
     start = torch.randn(shape, generator=generator, dtype=torch.float64).to(dtype)
-    ours = [start.clone(), torch.zeros_like(start), torch.zeros_like(start)]
-    exact = [t.double() for t in ours]
+    ours = [t.to(device) for t in (start.clone(), torch.zeros_like(start), torch.zeros_like(start))]
+    exact = [t.cpu().double() for t in ours]
     never = torch.arange(len(start)) % 7 == 0
     for step, gradient in enumerate(gradients_of(shape, 50, dtype), start=1):
         seen = (torch.rand(len(start), generator=generator) < 0.5) & ~never if sparse else None
-        before = [t.clone() for t in ours]
-        take_step(ours, gradient, seen, step)
+        before = [t.cpu().clone() for t in ours]
+        take_step(ours, gradient.to(device), seen if seen is None else seen.to(device), step)
         exact_step(exact[0], gradient.double(), *exact[1:], seen if sparse else slice(None), 0 if sparse else step)
-        assert not sparse or all(torch.equal(old[~seen], new[~seen]) for old, new in zip(before, ours, strict=True))
+        assert not sparse or all(
+            torch.equal(old[~seen], new.cpu()[~seen]) for old, new in zip(before, ours, strict=True)
+        )
+    ours = [t.cpu() for t in ours]
     unit = torch.finfo(dtype).eps
     # Each step rounds the moments by two or three operations of one unit each, and beta fades earlier errors.
     for got, wanted in zip(ours[1:], exact[1:], strict=True):
@@ -82,12 +85,12 @@ def test_columns_left_out_are_not_touched(columns, sparse):
         torch.testing.assert_close(got[:, :columns], wanted[:, :columns], rtol=1e-5, atol=1e-6)
 
 
-def test_many_tensors_in_one_call_are_each_by_itself():
+@CPU_AND_GPU
+def test_many_tensors_in_one_call_are_each_by_itself(device):
     """Twenty tensors, more than one launch on a GPU takes, each with its own rate, columns and counter."""
     generator = torch.Generator().manual_seed(4)
     shapes = [(), (7,), (300, 1), (40, 15, 3), (0, 3)] * 4
-    together = [[torch.randn(shape, generator=generator) for shape in shapes] for _ in range(3)]
-    gradients = [torch.randn(shape, generator=generator) for shape in shapes]
+    *together, gradients = ([torch.randn(shape, generator=generator).to(device) for shape in shapes] for _ in range(4))
     together[2] = [square**2 for square in together[2]]
     alone = [[t.clone() for t in tensors] for tensors in together]
     counters = [torch.tensor(float(i)) for i in range(len(shapes))]

@@ -9,7 +9,7 @@ import torch
 from gaussians import GROUPS, model, pipeline
 
 import gaussian_renderer
-from gaussian_renderer import render, scored_views
+from gaussian_renderer import render
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import Exposures
@@ -102,23 +102,6 @@ def test_the_report_leaves_equal_channels_out_and_names_the_other_mean(camera, c
     assert f"(mean of the channels'; {whole:.3f} as metrics.py)" in capsys.readouterr().out
     exact = _report(camera, lambda *_, **__: {"render": torch.ones_like(image)})
     assert exact == {"test_l1": 0.0, "train_l1": 0.0}
-
-
-def test_scores_are_computed_without_depth(camera, monkeypatch):
-    """Neither the scores nor the training report computes an inverse depth, which nothing reads."""
-    asked = []
-
-    def spy(*args: object, **options: object) -> dict:
-        asked.append(options["want_depth"])
-        return render(*args, **options)
-
-    for module in (scored_views, report):
-        monkeypatch.setattr(module, "render", spy)
-    scored_views.ScoredViews(pipeline(), BLACK, False).image(camera, model(5))
-    _report(camera, spy)
-    assert asked == [False] * 7
-    # Somebody else's renderer is given the reference's arguments alone.
-    _report(camera, lambda *four: render(*four))
 
 
 @pytest.mark.parametrize("more", [(), (1.0, False, None), (1.0, False, None, True)])
