@@ -7,11 +7,9 @@ import pytest
 import train
 from arguments import (
     OPTIONS,
-    GroupParams,
     ModelParams,
     OptimizationParams,
     OptionParser,
-    ParamGroup,
     PipelineParams,
     get_combined_args,
     read_cfg_args,
@@ -102,48 +100,6 @@ def test_absurd_values_name_their_option(option, value):
 
 
 # Groups as code for the reference writes them
-
-
-class PlainPipeline(PipelineParams):
-    """As code written for the reference replaces the options of a group."""
-
-    def __init__(self, parser: argparse.ArgumentParser) -> None:
-        self.convert_SHs_python = self.antialiasing = True
-        self.compute_cov3D_python = self.debug = False
-        ParamGroup.__init__(self, parser, "Pipeline")
-
-
-class FewOptions(OptimizationParams):
-    def __init__(self, parser: argparse.ArgumentParser) -> None:
-        self.iterations, self.lambda_dssim, self.seed, self.steps = 7, 0.2, 0.0, [1, 2]
-        super(OptimizationParams, self).__init__(parser, "Few")
-
-
-class PlainModel(ModelParams):
-    def __init__(self, parser: argparse.ArgumentParser, sentinel: bool = False) -> None:
-        self.sh_degree, self._source_path, self.images, self._extra = 2, "", "images", 5
-        super(ModelParams, self).__init__(parser, "Loading", sentinel)
-
-
-def test_groups_of_others_have_their_own_options_and_defaults():
-    parser = argparse.ArgumentParser()
-    pipeline, few, model = PlainPipeline(parser), FewOptions(parser), PlainModel(parser)
-    args = parser.parse_args(["-s", "/a", "-e", "6"])
-    values = {"convert_SHs_python": True, "compute_cov3D_python": False, "debug": False, "antialiasing": True}
-    assert vars(pipeline.extract(args)) == vars(pipeline.extract(argparse.Namespace())) == values
-    got = vars(few.extract(args))
-    assert got == {"iterations": 7, "lambda_dssim": 0.2, "seed": 0.0, "steps": [1, 2]} and type(got["seed"]) is float
-    assert vars(model.extract(args)) == {"sh_degree": 2, "source_path": "/a", "images": "images", "extra": 6}
-    with pytest.raises(SystemExit):
-        parser.parse_args(["-i", "x"])  # the group's `images` has no short form
-    with pytest.raises(UserError, match="--lambda_dssim must be"):  # the default of our table, and so its check
-        few.extract(parser.parse_args(["--lambda_dssim", "2"]))
-    parser = argparse.ArgumentParser()
-    model = PlainModel(parser, sentinel=True)
-    args = parser.parse_args([])
-    values = model.extract(args)
-    assert args.sh_degree is None and values.sh_degree == 2
-    assert isinstance(values, GroupParams) and isinstance(values, argparse.Namespace)
 
 
 def test_groups_carry_their_defaults_as_the_references_do():

@@ -12,7 +12,6 @@ import train
 from splatting.evaluation.model_folder import training_joules
 from splatting.evaluation.training_log import Stopwatch, TrainingLog
 from splatting.host.energy import joules_counter
-from splatting.training import run
 
 
 class NvmlError(Exception):
@@ -105,7 +104,8 @@ def test_a_training_writes_its_joules_where_they_are_known(colmap_scene, tmp_pat
     assert _joules(tmp_path / "without") == [None, None]
 
     reads = iter(range(1000))
-    monkeypatch.setattr(run, "joules_counter", lambda gpus: (lambda: float(next(reads))) if gpus == [None] else None)
+    counter = "splatting.training.run.joules_counter"
+    monkeypatch.setattr(counter, lambda gpus: (lambda: float(next(reads))) if gpus == [None] else None)
     train.main([*words, "-m", str(tmp_path / "with")])
     first, last = _joules(tmp_path / "with")
     assert 0 < first < last

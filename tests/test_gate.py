@@ -3,7 +3,6 @@
 import json
 import math
 import re
-import sys
 
 import pytest
 
@@ -126,23 +125,6 @@ def test_the_gate_is_written_and_then_passed(monkeypatch, stand_in, capsys):
     printed = capsys.readouterr().out
     assert printed.endswith("3 of 15 are worse than at ddddddd\n") and printed.count("WORSE") == 3
     assert turns.count((0, "this")) == turns.count((0, "stored")) == 3 * gate.MOST_TURNS
-
-
-def test_the_stored_build_is_a_checkout_of_its_commit(monkeypatch, tmp_path):
-    if not (trainings.ROOT / ".git").exists():
-        pytest.skip("a copy without git")
-    monkeypatch.setattr(trainings, "WORK", tmp_path)
-    monkeypatch.setattr(trainings, "_build_extensions", lambda folder: (folder / "site").mkdir())
-    for commit, same in (("HEAD", True), ("HEAD~1", False)):
-        monkeypatch.setattr(trainings, "_same_extensions", lambda _, same=same: same)
-        build = trainings.older_build(commit)
-        assert (build.folder / "train.py").is_file() and build.folder == tmp_path / commit
-        (build.folder / "tell.py").write_text("import os, sys; sys.exit(os.environ.get('PYTHONPATH'))")
-        told = build.run([sys.executable, str(trainings.ROOT / "tell.py")], PYTHONPATH="installed").lines
-        assert told == ["installed" if same else str(build.folder / "site")]
-        assert trainings.older_build(commit) == build
-    with pytest.raises(UserError, match="git has no commit 0123456 here; fetch the whole history"):
-        trainings.older_build("0123456")
 
 
 def test_the_stored_file_fits_the_code():

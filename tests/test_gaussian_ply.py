@@ -316,17 +316,6 @@ def test_rows_are_counted_however_the_header_is_written(tmp_path, old, new):
             read(path)
 
 
-@pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
-@pytest.mark.parametrize("last", ["", "end"])
-def test_a_file_as_long_as_its_header_says_is_read(tmp_path, end, last):
-    """With the shortest of rows, any end of lines, and without the end of the last one."""
-    lines = ["ply", "format ascii 1.0", "comment end_header", "element vertex 2"]
-    lines += [*(f"property uchar {name}" for name in ("x", "y", "z", "red", "green", "blue")), "end_header"]
-    lines += ["1 2 3 0 0 0"] * 2
-    (tmp_path / "a.ply").write_bytes((end.join(lines) + (end if last else "")).encode())
-    assert read_point_cloud(tmp_path / "a.ply").points.tolist() == [[1, 2, 3]] * 2
-
-
 def test_gaussians_that_are_not_drawn_are_told_of(tmp_path, capsys):
     gaussians = model(6)
     with torch.no_grad():

@@ -1,6 +1,5 @@
 """render.py: its files for a view, and its timing; test_end_to_end.py tests the whole command."""
 
-import json
 import math
 import shutil
 from argparse import ArgumentParser, Namespace
@@ -117,24 +116,6 @@ def test_a_model_without_gaussians_is_refused(folder, run):
     with pytest.raises(UserError, match="iteration 7 of .* has no Gaussians"):
         run()
     assert sorted(path.name for path in folder.iterdir()) == ["cfg_args", "point_cloud"]
-
-
-def test_views_by_the_references_arguments(tmp_path, rendered, capsys):
-    image = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(2))
-    one = view(torch.zeros(3, 4, 5, dtype=torch.uint8))
-    rendered[id(one)] = image
-    pipe, background = Namespace(antialiasing=False), torch.zeros(3)
-    # A model of which only the length is read.
-    assert render.render_set(str(tmp_path), "test", 30, [one], range(7), pipe, background) is None
-    folder = tmp_path / "test" / "ours_30"
-    assert names(folder, "*.*") == ["gt/00000.png", "render_times.json", "renders/00000.png"]
-    assert json.loads((folder / "render_times.json").read_text())["gaussians"] == 7
-    assert np.array_equal(read(folder / "renders" / "00000.png"), to_bytes(image).numpy())
-    assert "test: 1 views, median" in capsys.readouterr().out
-    # Half images, and the two arguments that 2023 did not have; its options lack antialiasing.
-    render.render_set(str(tmp_path), "train", 30, [one], range(7), Namespace(), background, True, True)
-    half = read(tmp_path / "train" / "ours_30" / "renders" / "00000.png")
-    assert np.array_equal(half, to_bytes(image[..., 2:]).numpy())
 
 
 def test_sets_by_the_references_arguments(folder, colmap_scene, monkeypatch, capsys):

@@ -29,17 +29,14 @@ SETS = {
         *("--lenses", "native", "--filter_3d", "--antialiasing", "--optimizer_type", "sparse_adam"),
     ),
     "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5, "--lenses", "undistort", "--masks", "masks"),
-    "poses": (
-        *("--refine_poses", "--init_type", "random", "--robust_mask", 0.2, "--sky", "auto"),
-        *("--strategy", "budget", "--images_to_load", 5),
-    ),
+    "poses": ("--refine_poses", "--robust_mask", 0.2, "--sky", "auto", "--strategy", "budget", "--images_to_load", 5),
     "in PyTorch": ("--convert_SHs_python", "--compute_cov3D_python", "--strategy", "mcmc", "-i", "images/."),
     "RGBA on white": ("-w", "--mask_meaning", "ignore"),
 }
 OWN = {"ignored": 20, "ppisp": None, "affine": None, "RGBA on white": None}  # first columns that count; None: others
 # Options that change how well a model trains, or what is written, but not what is drawn or compared.
 OTHERS = {
-    *("source_path", "model_path", "data_device", "eval", "init_pcd_path", "init_ply", "debug", "seed", "iterations"),
+    *("source_path", "model_path", "data_device", "eval", "init_type", "init_pcd_path", "init_ply", "debug", "seed"),
     *("position_lr_init", "position_lr_final", "position_lr_delay_mult", "position_lr_max_steps", "feature_lr"),
     *("opacity_lr", "scaling_lr", "rotation_lr", "exposure_lr_init", "exposure_lr_final", "exposure_lr_delay_steps"),
     *("exposure_lr_delay_mult", "percent_dense", "lambda_dssim", "densification_interval", "opacity_reset_interval"),
@@ -47,7 +44,7 @@ OTHERS = {
     *("depth_l1_weight_final", "gpu_memory", "max_num_splats", "keep_unseen"),
     *("absgrad", "absgrad_threshold", "split", "mcmc_until_iter", "mcmc_growth", "mcmc_min_opacity"),
     *("mcmc_noise", "mcmc_opacity_reg", "mcmc_scale_reg"),
-    *("mcmc_init_opacity", "mcmc_init_scale", "opacity_decay"),
+    *("mcmc_init_opacity", "mcmc_init_scale", "opacity_decay", "iterations"),
     *("prune_opacity", "time_budget", "schedule"),
 }
 

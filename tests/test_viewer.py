@@ -351,21 +351,16 @@ def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch
     for chosen, options, places in (
         ("2: at 2 s", ("1: at 0 s", "2: at 4 s", "3: at 6 s"), [1, 3, 4]),
         ("1: at 0 s", ("1: at 0 s", "2: at 2 s"), [3, 4]),  # a path begins at 0
-        ("2: at 2 s", ("1: at 0 s",), [3]),
-        ("1: at 0 s", ("none yet",), []),
     ):
         recorded.chosen.value = chosen
         recorded.delete(client := _client())
         assert recorded.chosen.options == options and recorded.chosen.value in options
         assert [key.position[0] for key in recorded.keyframes] == places
-        there = places[options.index(recorded.chosen.value)] if places else 1  # where it was
-        assert client.camera.position[0] == there, "the picture is not that of the chosen keyframe"
+        assert client.camera.position[0] == places[options.index(recorded.chosen.value)]
     monkeypatch.setattr(path_tab, "_MOST", 3)
-    for _ in range(3):
-        recorded.add(_client())
+    recorded.add(_client())
     with pytest.raises(UserError, match="at most 3 keyframes"):
         recorded.add(_client())
-    assert len(recorded.keyframes) == 3
 
 
 @pytest.mark.parametrize("name", ["", "..", "../a", "a/b", "a\\b", "/etc/x", "a.json", "a\0b", "ä", "a\n", "x" * 65])

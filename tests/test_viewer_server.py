@@ -209,27 +209,6 @@ def test_a_frame_that_cannot_be_drawn_is_told_once_until_one_can_and_ends_nothin
             assert capfd.readouterr().err.count("could not draw a frame (no file") == 1, told
 
 
-def test_each_browser_reads_the_scale_of_its_own_frame(page):
-    def until(words: str, different: int) -> None:
-        def holds() -> bool:
-            answer(page)
-            texts = [shown.content for shown in page._legends.values() if shown.visible]
-            return len(texts) == 2 == sum(words in text for text in texts) and len(set(texts)) == different
-
-        wait_for(holds)
-
-    with Client(page.url) as near, Client(page.url) as far, _restored(page):
-        for client, z in ((near, -2.0), (far, -8.0)):
-            client.look((0.0, 0.0, z))
-            _answered(page, client)
-        assert len(page._legends) == 2 and not any(shown.visible for shown in page._legends.values())
-        _set(near, page.view.mode, "Depth")
-        until("Depth", 2)
-        _set(near, page.view.mode, "Error")
-        until("No photo", 1)
-    wait_for(lambda: not page._legends)
-
-
 def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
     view, folder = page.view, page.view.crop_file.folder
     with Client(page.url) as client, _restored(page):
