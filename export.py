@@ -114,7 +114,7 @@ def thin_out(
 def sky_of(model: str | None, means: np.ndarray) -> np.ndarray:
     """(N,) bool: which Gaussians with centres (N, 3) are the sky of a model. UserError for a folder without one."""
     facts = read_model_json(Path(model)) if model else {}
-    found = [mask for beside in tools("beside") if (mask := beside(facts, torch.from_numpy(means))) is not None]
+    found = [mask for backdrop in tools("backdrop") if (mask := backdrop(facts, torch.from_numpy(means))) is not None]
     if not found:
         raise UserError("--no_sky needs a model folder (-m) that was trained with a sky; leave it out")
     return found[0].numpy()

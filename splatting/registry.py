@@ -123,8 +123,8 @@ def tools(name: str) -> list[Callable]:
     """The functions of a name that modules of parts have for others, which thus need no part.
 
     advise(scene, tracks): findings on a scene, and options of train.py that they speak for.
-    beside(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
-    advise_trained(scene, views): as advise, by a short training. examine(scene, views, options): notes of doctor.py.
+    backdrop(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
+    advise_trained(scene, views): as advise, by a short training. examine(scene, views): notes of doctor.py.
     drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
     for_few_iterations(count): remedies.
     pictures(model): files in a model folder that reports show, where they are there.

@@ -45,8 +45,8 @@ def of_scene(scene: Scene) -> GaussianModel:
     gaussians, facts = scene.gaussians, read_model_json(scene.model_path)
     means = gaussians.get_xyz.detach()
     own = torch.ones(len(means), dtype=torch.bool, device=means.device)
-    for beside in tools("beside"):
-        if (found := beside(facts, means)) is not None:
+    for backdrop in tools("backdrop"):
+        if (found := backdrop(facts, means)) is not None:
             own &= ~found
     return gaussians if own.all() or not own.any() else gaussians.part(own, gaussians.max_sh_degree)
 

@@ -171,7 +171,7 @@ def _wrong_values(gaussians: GaussianModel, extent: float) -> Iterator[Finding]:
 def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
     """What parts of a training say of a trained model."""
     for examine in tools("examine"):
-        yield from examine(scene, _scored(scene, options), options)
+        yield from examine(scene, _scored(scene, options))
 
 
 def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:

@@ -9,8 +9,6 @@ from splatting.option import Option, within
 from splatting.part import Error, Needs, Options, Part, fill
 
 if TYPE_CHECKING:
-    import argparse
-
     from torch import Tensor
 
     from gaussian_renderer.scored_views import ScoredViews
@@ -76,7 +74,7 @@ def advise_trained(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
     yield note(text, f"--robust_mask {MASKED:g}" if share > FEW else "")
 
 
-def examine(scene: "Scene", views: "ScoredViews", options: "argparse.Namespace") -> Iterator[Finding]:
+def examine(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
     """Notes on a trained model."""
     from arguments import read_training_options
     from splatting.host.listing import some

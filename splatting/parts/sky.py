@@ -69,7 +69,7 @@ def advise(scene: "Scene", tracks: "Sequence[Track | None]") -> Iterator[Finding
         yield note(said_of_sky(share), "--sky auto" if share >= FEWEST else "")
 
 
-def beside(facts: dict[str, Any], means: "Tensor") -> "Tensor | None":
+def backdrop(facts: dict[str, Any], means: "Tensor") -> "Tensor | None":
     """Which Gaussians are far away, large and opaque by intent, (N,) bool; None: there is no sky.
 
     facts: of model.json. means: (N, 3) in the model's frame.
