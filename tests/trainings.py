@@ -66,7 +66,7 @@ PART_OPTIONS = {  # that begin with something of a checkpoint, or of the scene
     "time_budget": PYRAMID,
     "exposure": ("--train_test_exp",),
     "refine_poses": ("--refine_poses",),
-    "depth_maps": ("-d", "depths", "--depth_l1_weight_init", 1.0),
+    "depths": ("-d", "depths", "--depth_l1_weight_init", 1.0),
     "robust_mask": ("--robust_mask", 0.3),
     "adc": ("--strategy", "adc", "--absgrad", "--absgrad_threshold", 2e-4, "--max_num_splats", 400),
     "mcmc": MCMC,
