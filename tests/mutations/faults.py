@@ -59,9 +59,9 @@ FAULTS = (
     Fault(
         "half of a warp's lanes not summed",
         "ROCm/gsplat#18",
-        f"{CSRC}/cuda/blend_backward.cu",
-        "  sum += __shfl_xor_sync(kWarp, sum, 1);\n",
-        "",
+        f"{CSRC}/cuda/pixel_sums.cuh",
+        "        kept[i] = v[i] + __shfl_xor_sync(kWarp, v[i], kStep);\n",
+        "        kept[i] = v[i];\n",
     ),
     Fault(
         "mean on a tile's border pixel culled",

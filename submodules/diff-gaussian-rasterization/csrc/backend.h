@@ -20,8 +20,9 @@ template <class T>
 struct RowMemory {
   T* (*take)(void* context, int64_t rows);  // as in SplatRows
   void* context;
-  int32_t* counts;  // (N) rows of each splat, filled
-  bool absolute;    // whether rows have what lengths of absolute gradients need
+  int32_t* counts;      // (N) rows of each splat, filled
+  bool absolute;        // whether rows have what lengths of absolute gradients need
+  T* values = nullptr;  // (N, channels), filled: the gradient of Channels::values, or null
 };
 
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
@@ -37,17 +38,11 @@ struct RowMemory {
   void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                                 \
   template <class T>                                                                                 \
   void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                       \
-  /* The rows of the processed instances, which blend_vjp sums. No gradient's output is written. */  \
+  /* The rows of the processed instances, which blend_vjp sums. No gradient's output is written. Of  \
+     channels the first three are in the rows, as a colour, and on a GPU there may be more rows than \
+     those of all splats, which come first. */                                                       \
   template <class T>                                                                                 \
   void blend_rows(const Where&, const BlendInput<T>&, const BlendGradient<T>&, const RowMemory<T>&); \
-  template <class T>                                                                                 \
-  void blend_channels(const Where&, const BlendInput<T>&, const Channels<T>&, const Blended<T>&);    \
-  /* The same as blend_rows, and the gradient of the channels' values, (N, count), unless null. The  \
-     first three channels' gradients are in the rows, too, as those of a colour. On a GPU there may  \
-     be more rows than those of all splats, which come first. */                                     \
-  template <class T>                                                                                 \
-  void channel_rows(const Where&, const BlendInput<T>&, const Channels<T>&, const BlendGradient<T>&, \
-                    const RowMemory<T>&, T* values);                                                 \
   template <class T>                                                                                 \
   void mark_decisive(const Where&, const BlendInput<T>&, const int32_t* last, bool* decisive);       \
   template <class T>                                                                                 \

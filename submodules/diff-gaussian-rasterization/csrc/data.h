@@ -157,21 +157,35 @@ struct Binned {
   int64_t* ranges;     // (tiles + 1) into instances
 };
 
+// Values that splats show in place of colours, any number of them. Then there are no inverse depth and no layers.
+template <class T>
+struct Channels {
+  const T* values = nullptr;      // (N, stride), the first splat's
+  int64_t stride = 0, count = 0;  // 0: splats show colours
+  T cap = 0;                      // the largest alpha
+  bool stops = false;             // whether a gradient ends at the cap
+
+  const T* of(int64_t splat) const { return values + stride * splat; }
+};
+
 template <class T>
 struct BlendInput {
   const T* splats;
   const int32_t* instances;
   const int64_t* ranges;
-  const T* background;  // 3
+  const T* background;  // (C)
   Image image;
   int64_t instance_count;  // where the ranges end, or more
   Rays rays = kNoRays;
   const T* table = nullptr;
+  Channels<T> channels = {};
+
+  int64_t planes() const { return channels.count ? channels.count : 3; }  // C, of an image and of its gradient
 };
 
 template <class T>
 struct Blended {
-  T* color;          // (3, H, W)
+  T* color;          // (C, H, W)
   T* transmittance;  // (H, W)
   T* inverse_depth;  // (H, W), or null
   int32_t* last;     // (H, W) 1 + position in the tile's list of the last splat blended, or null
@@ -181,27 +195,16 @@ struct Blended {
 // Blending takes so many channels at once; of more, there are several passes.
 constexpr int kMostChannels = 32;
 
-// Values that splats show in place of colours, any number of them. Then in a BlendInput the background, in Blended and
-// BlendGradient the color have `count` planes, and there are no inverse depth and no layers.
-template <class T>
-struct Channels {
-  const T* values;  // (N, stride), the first splat's
-  int64_t stride;
-  int64_t count;
-  T cap;       // the largest alpha
-  bool stops;  // whether a gradient ends at the cap
-};
-
-// Calls run(first, pass, in, plane) for each pass over channels: where its channels begin, the pass as channels and as
-// an input of blending, and where its planes of an image begin.
+// Calls run(first, pass, plane) for each pass over channels: where its channels begin, and where its planes of an
+// image do.
 template <class T, class Run>
-void each_pass(const Channels<T>& all, const BlendInput<T>& in, const Run& run) {
-  for (int64_t first = 0; first < all.count; first += kMostChannels) {
-    const int64_t left = all.count - first, count = left < kMostChannels ? left : kMostChannels;
-    BlendInput<T> own = in;
-    own.background += first;
-    run(first, Channels<T>{all.values + first, all.stride, count, all.cap, all.stops}, own,
-        first * in.image.width * in.image.height);
+void each_pass(const BlendInput<T>& in, const Run& run) {
+  for (int64_t first = 0; first < in.channels.count; first += kMostChannels) {
+    const int64_t left = in.channels.count - first;
+    BlendInput<T> pass = in;
+    pass.background += first, pass.channels.values += first;
+    pass.channels.count = left < kMostChannels ? left : kMostChannels;
+    run(first, pass, first * in.image.width * in.image.height);
   }
 }
 

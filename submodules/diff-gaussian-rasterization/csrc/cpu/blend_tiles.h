@@ -4,13 +4,12 @@
 
 #include "../backend.h"
 #include "../math/exp2.h"
-#include "tile_chunk.h"
+#include "further_channels.h"
 
 GS_ISA_BEGIN
 
 namespace {
 
-constexpr int kChunk = 128;  // splats held at once, some 6 KB of floats
 constexpr int kChunkWords = kChunk / 64;
 
 // A splat's RowTerms or RayRow of a row, from arrays of a chunk's splats.
@@ -81,7 +80,7 @@ struct Strip : Rows<T, kRays> {
 // The state of a tile's pixels between two chunks.
 template <class T>
 struct ForwardState {
-  alignas(64) T transmittance[kPixels], color[3][kPixels], depth[kPixels];
+  alignas(64) T transmittance[kPixels], payload[kLeading][kPixels];
   alignas(64) T threshold[kPixels];  // log2 alpha that a splat must reach; infinite once the pixel has ended
   alignas(64) typename IntOf<T>::type last[kPixels];
 };
@@ -126,21 +125,20 @@ __attribute__((always_inline)) inline bool blend_weights(const Chunk<T, kChunk, 
 }
 
 // Blends a chunk into a strip, as above.
-template <class T, bool kDepth, bool kLast, int kRays>
+template <class T, int kPayload, bool kLast, int kRays>
 bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& strip, int64_t position,
-                 ForwardState<T>& state) {
+                 ForwardState<T>& state, FurtherPlanes<T, kPayload>& further) {
   using S = Simd<T>;
   using V = typename S::Vec;
   const int at = strip.at();
-  V red = S::load(state.color[0] + at), green = S::load(state.color[1] + at), blue = S::load(state.color[2] + at);
-  V depth = {};
-  if (kDepth) depth = S::load(state.depth + at);
-  const bool open = blend_weights<T, kLast>(chunk, strip, position, T(kMaxAlpha), state, [&](int k, V weight) {
-    red += weight * chunk.r[k], green += weight * chunk.g[k], blue += weight * chunk.b[k];
-    if (kDepth) depth += weight * chunk.inverse_depth[k];
+  V sums[kWidth<kPayload>];
+  for (int c = 0; c < kWidth<kPayload>; ++c) sums[c] = S::load(state.payload[c] + at);
+  const bool open = blend_weights<T, kLast>(chunk, strip, position, further.cap(), state, [&](int k, V weight) {
+    for (int c = 0; c < kWidth<kPayload>; ++c) sums[c] += weight * chunk.payload[c][k];
+    if constexpr (kPayload == kChannels) further.weigh(position + k, weight);
   });
-  S::store(state.color[0] + at, red), S::store(state.color[1] + at, green), S::store(state.color[2] + at, blue);
-  if (kDepth) S::store(state.depth + at, depth);
+  for (int c = 0; c < kWidth<kPayload>; ++c) S::store(state.payload[c] + at, sums[c]);
+  if constexpr (kPayload == kChannels) further.add(at);
   return open;
 }
 
@@ -172,24 +170,25 @@ void through_tile(const BlendInput<T>& in, const Tile& tile, int64_t index, T* t
   }
 }
 
-template <class T, bool kDepth, bool kLast, int kRays>
+template <class T, int kPayload, bool kLast, int kRays>
 void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
   const Tile tile(index, in.image);
   ForwardState<T> state;
+  FurtherPlanes<T, kPayload> further(in, index);
   std::fill_n(state.transmittance, kPixels, T(1));
-  std::fill_n(state.color[0], 3 * kPixels, T(0));
-  if (kDepth) std::fill_n(state.depth, kPixels, T(0));
+  std::fill_n(state.payload[0], kWidth<kPayload> * kPixels, T(0));
   if (kLast) std::fill_n(state.last, kPixels, 0);
   through_tile<T, kRays>(in, tile, index, state.threshold,
                          [&](const auto& chunk, const Strip<T, kRays>& strip, int64_t position) {
-                           return blend_strip<T, kDepth, kLast>(chunk, strip, position, state);
+                           return blend_strip<T, kPayload, kLast>(chunk, strip, position, state, further);
                          });
-  for (int c = 0; c < 3; ++c) {
-    for (int p = 0; p < kPixels; ++p) state.color[c][p] += state.transmittance[p] * in.background[c];
-    write_tile(state.color[c], in.image, tile, out.color + int64_t(c) * in.image.width * in.image.height);
+  for (int64_t c = 0; c < in.planes(); ++c) {
+    T* plane = c < kLeading ? state.payload[c] : further.plane(c);
+    for (int p = 0; p < kPixels; ++p) plane[p] += state.transmittance[p] * in.background[c];
+    write_tile(plane, in.image, tile, out.color + c * in.image.width * in.image.height);
   }
   write_tile(state.transmittance, in.image, tile, out.transmittance);
-  if (kDepth) write_tile(state.depth, in.image, tile, out.inverse_depth);
+  if (kPayload == kColorAndDepth) write_tile(state.payload[3], in.image, tile, out.inverse_depth);
   if (kLast) write_tile(state.last, in.image, tile, out.last);
 }
 
@@ -234,9 +233,11 @@ void mark_tile(const BlendInput<T>& in, const int32_t* last_plane, int64_t index
 
 template <class T, int kRays>
 void blend_tiles(const Executor& executor, const BlendInput<T>& in, const Blended<T>& out) {
-  const auto run = out.inverse_depth
-                       ? (out.last ? blend_tile<T, true, true, kRays> : blend_tile<T, true, false, kRays>)
-                       : (out.last ? blend_tile<T, false, true, kRays> : blend_tile<T, false, false, kRays>);
+  auto run = out.inverse_depth
+                 ? (out.last ? blend_tile<T, kColorAndDepth, true, kRays> : blend_tile<T, kColorAndDepth, false, kRays>)
+                 : (out.last ? blend_tile<T, kColor, true, kRays> : blend_tile<T, kColor, false, kRays>);
+  if constexpr (kRays != kLensRays)
+    if (in.channels.count) run = blend_tile<T, kChannels, true, kRays>;
   const int64_t tiles = tiles_of(in.image);
   for_dynamic(executor, tiles, 1, [&](int64_t tile, int64_t) { run(in, tile, out); });
 }

@@ -8,197 +8,12 @@
 #include "../math/absolute.h"
 #include "../math/exp2.h"
 #include "../math/slots.h"
-#include "gs/lane_halves.h"
-#include "tile_chunk.h"
+#include "further_channels.h"
+#include "row_table.h"
 
 GS_ISA_BEGIN
 
 namespace {
-
-constexpr int kBatch = 64;  // splats held at once, some 3 KB of floats, and 12 KB of their terms
-
-// A vector has kColumns of a row, or of two rows in turn: most splats reach few columns. Pixels lie in that order.
-template <class T>
-constexpr int kRows = Simd<T>::kLanes > 8 ? 2 : 1;
-template <class T>
-constexpr int kColumns = Simd<T>::kLanes / kRows<T>;
-
-// The place of a pixel, whose row is a multiple of kRows.
-template <class T>
-int place(int row, int column) {
-  return row * kTile + column * kRows<T>;
-}
-
-// Puts a tile's pixels from rows to their places.
-template <class T, class Value>
-void interleave(Value* pixels) {
-  if constexpr (kRows<T> == 2)
-    for (Value* pair = pixels; pair < pixels + kPixels; pair += 2 * kTile) {
-      Value rows[2 * kTile];
-      std::copy_n(pair, 2 * kTile, rows);
-      for (int c = 0; c < kTile; ++c) pair[2 * c] = rows[c], pair[2 * c + 1] = rows[kTile + c];
-    }
-}
-
-// The vector of a row's value, or of two rows' in turn.
-template <class T>
-typename Simd<T>::Vec by_rows(const T (&values)[kTile][kBatch], int row, int k) {
-  using S = Simd<T>;
-  if constexpr (kRows<T> == 1) return S::all(values[row][k]);
-  typename S::Mask odd;
-  for (int i = 0; i < S::kLanes; ++i) odd[i] = -(i % 2);
-  return odd ? S::all(values[row + kRows<T> - 1][k]) : S::all(values[row][k]);
-}
-
-// The columns of a vector's pixels.
-template <class T>
-typename Simd<T>::Vec columns_from(int first) {
-  T x[Simd<T>::kLanes];
-  for (int i = 0; i < Simd<T>::kLanes; ++i) x[i] = T(first + i / kRows<T>);
-  return Simd<T>::load(x);
-}
-
-template <class T, int kRays>
-struct BackwardState {
-  TilePlaces<T, kRays> places, in_place;  // in_place: the same, as all that follows
-  alignas(64) T transmittance[kPixels], behind[kPixels];
-  alignas(64) T color[3][kPixels], depth[kPixels];  // the image's gradient
-  alignas(64) typename IntOf<T>::type last[kPixels];
-  alignas(64) typename IntOf<T>::type row_last[kTile];  // the largest in a row
-};
-
-// The columns that each splat of a chunk can reach, first <= column <= last; the exact test follows. As in tile_rect,
-// with its margins.
-template <class T>
-struct ColumnRanges {
-  int32_t first[kBatch], last[kBatch];
-
-  void find(const Chunk<T, kBatch, kNoRays>& chunk, int64_t count, const TilePlaces<T, kNoRays>&) {
-    for (int64_t k = 0; k < count; ++k) {
-      const T slope = chunk.l12[k] / chunk.l22[k];
-      const T level = larger(chunk.log2_opacity[k] - T(kLog2MinAlpha), T(0));
-      const T reach = std::sqrt(level) * T(1.0001) + T(0.01);
-      const T dx = reach * std::sqrt(1 + slope * slope) / chunk.l11[k] + T(0.01);
-      set(k, chunk.x[k] - dx, chunk.x[k] + dx);
-    }
-  }
-  // By the places of each column's pixels.
-  void find(const Chunk<T, kBatch, kLensRays>& chunk, int64_t count, const TilePlaces<T, kLensRays>& places) {
-    T least[kTile], most[kTile];
-    for (int c = 0; c < kTile; ++c) {
-      least[c] = most[c] = places.x[c];
-      for (int p = c + kTile; p < kPixels; p += kTile)
-        least[c] = std::min(least[c], places.x[p]), most[c] = std::max(most[c], places.x[p]);
-    }
-    for (int64_t k = 0; k < count; ++k) {
-      const XLimits<T> limits = x_limits(chunk.template terms<T>(k));
-      first[k] = 0, last[k] = kTile - 1;
-      while (first[k] < kTile - 1 && most[first[k]] < limits.low) ++first[k];
-      while (last[k] > first[k] && least[last[k]] > limits.high) --last[k];
-    }
-  }
-  void find(const Chunk<T, kBatch, kPinholeRays>& chunk, int64_t count, const TilePlaces<T, kPinholeRays>&) {
-    for (int64_t k = 0; k < count; ++k) {
-      RaySplat<T> splat = {};
-      splat.l11 = chunk.l11[k], splat.l12 = chunk.l12[k], splat.l22 = chunk.l22[k];
-      splat.log2_opacity = chunk.log2_opacity[k], splat.slope_u = chunk.slope_u[k];
-      splat.slope_v = chunk.slope_v[k], splat.e = chunk.e[k];
-      const Extent<T> to = extent_of(splat);
-      set(k, chunk.x[k] - to.left, chunk.x[k] + to.right);
-    }
-  }
-
- private:
-  void set(int64_t k, T left, T right) {
-    const T end = T(kTile - 1);
-    first[k] = int32_t(left > 0 ? (left < end ? left : end) : T(0));  // what is not a number reaches all columns
-    last[k] = int32_t(right < end ? (right > 0 ? right : T(0)) : end);
-  }
-};
-
-// The terms of a batch's splats in all rows, RowTerms or RayRow.
-template <class T, int kRays>
-struct TermTable {
-  using V = typename Simd<T>::Vec;
-  alignas(64) T top[kTile][kBatch], u0[kTile][kBatch], v[kTile][kBatch];
-  void store(int row, int64_t k, const RowTerms<V>& terms) {
-    using S = Simd<T>;
-    S::store(top[row] + k, terms.top), S::store(u0[row] + k, terms.u0), S::store(v[row] + k, terms.v);
-  }
-  RowTerms<V> of(const Chunk<T, kBatch, kNoRays>& chunk, int row, int k) const {
-    return {by_rows<T>(top, row, k), Simd<T>::all(chunk.l11[k]), by_rows<T>(u0, row, k), by_rows<T>(v, row, k)};
-  }
-};
-template <class T>
-struct TermTable<T, kPinholeRays> {
-  using V = typename Simd<T>::Vec;
-  alignas(64) T u0[kTile][kBatch], v[kTile][kBatch];
-  void store(int row, int64_t k, const RayRow<V>& terms) {
-    Simd<T>::store(u0[row] + k, terms.flat.u0), Simd<T>::store(v[row] + k, terms.flat.v);
-  }
-  RayRow<V> of(const Chunk<T, kBatch, kPinholeRays>& chunk, int row, int k) const {
-    using S = Simd<T>;
-    return ray_row<V>(
-        {S::all(chunk.log2_opacity[k]), S::all(chunk.l11[k]), by_rows<T>(u0, row, k), by_rows<T>(v, row, k)},
-        S::all(chunk.slope_u[k]), S::all(chunk.slope_v[k]), S::all(chunk.e[k]));
-  }
-};
-
-template <class T>
-struct TermTable<T, kLensRays> {
-  LensTerms<T> of(const Chunk<T, kBatch, kLensRays>& chunk, int, int k) const { return chunk.template terms<T>(k); }
-};
-
-// The same, and the rows with pixels that each may reach.
-template <class T, int kRays>
-struct RowTable : TermTable<T, kRays> {
-  static constexpr int kParts = kRows<T> == 1 ? 1 : kTile / kColumns<T>;  // of a row
-  alignas(64) typename IntOf<T>::type reached[kParts][kBatch];            // a bit for each row
-
-  static auto splats_of(const Chunk<T, kBatch, kRays>& chunk, int64_t k) {
-    if constexpr (kRays == kLensRays)
-      return chunk.template terms<typename Simd<T>::Vec>(k);
-    else
-      return chunk.shapes(k);
-  }
-
-  // position: of the first splat in the tile's list.
-  void fill(const Chunk<T, kBatch, kRays>& chunk, int64_t count, int64_t position,
-            const BackwardState<T, kRays>& state) {
-    using S = Simd<T>;
-    using Int = typename S::Int;
-    const typename S::Mask lanes = __builtin_convertvector(lane_numbers<T>(0), typename S::Mask);
-    for (int64_t k = 0; k < count; k += S::kLanes) {
-      const auto splats = splats_of(chunk, k);
-      const typename S::Mask positions = lanes + Int(position + k);
-      typename S::Mask bits[kParts] = {};
-      for (int row = 0; row < kTile; ++row) {
-        constexpr int kPart = kTile / kParts;
-        const typename S::Mask wanted = (positions < state.row_last[row]) & Int(1 << row);
-        if constexpr (kRays == kLensRays) {
-          for (int p = 0; p < kParts; ++p)
-            bits[p] |= box_reached(splats, state.places.box(row * kTile + p * kPart, kPart)) & wanted;
-        } else {
-          const auto terms = row_terms(splats, T(row));
-          this->store(row, k, terms);
-          for (int p = 0; p < kParts; ++p) bits[p] |= row_reached(terms, T(p * kPart), T((p + 1) * kPart - 1)) & wanted;
-        }
-      }
-      for (int p = 0; p < kParts; ++p) std::memcpy(reached[p] + k, &bits[p], sizeof bits[p]);
-    }
-  }
-
-  // A bit for each row with which vectors begin: those of which the splat may reach one of theirs, in any part.
-  uint32_t rows(int k) const {
-    uint32_t bits = 0;
-    for (int p = 0; p < kParts; ++p) bits |= rows(k, p);
-    return bits;
-  }
-  uint32_t rows(int k, int part) const {
-    const uint32_t bits = uint32_t(reached[part][k]);
-    return kRows<T> == 1 ? bits : (bits | bits >> 1) & 0x5555;
-  }
-};
 
 // Sums of an instance: kGradientRow, and perhaps kAbsoluteValues.
 template <int kRays, bool kAbsolute>
@@ -271,9 +86,10 @@ auto pixels_at(const BackwardState<T, kRays>& state, int at, int column) {
 
 // Sums one splat's values, lane by lane, over the rows with a bit, in vectors from column `first` on, until `end`.
 // k: the splat in its batch.
-template <class T, int kRays, bool kDepth, bool kAbsolute>
+template <class T, int kRays, int kPayload, bool kAbsolute>
 __attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch, int k, int64_t position,
                                                     uint32_t bits, int first, int end, BackwardState<T, kRays>& state,
+                                                    FurtherSums<T, kPayload>& further,
                                                     Sums<T, kRays, kAbsolute>& sums) {
   using S = Simd<T>;
   using V = typename S::Vec;
@@ -282,7 +98,7 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch
   const RowTable<T, kRays>& table = batch.table;
   const V zero = {};
   PixelSums<T, kRays, kAbsolute> moments;
-  V red = zero, green = zero, blue = zero, depth = zero;
+  V payload[kLeading] = {};
   for (; bits; bits &= bits - 1) {
     const int row = __builtin_ctz(bits);
     const auto terms = table.of(chunk, row, k);
@@ -296,47 +112,52 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch
       const M reached = (t >= T(kLog2MinAlpha)) & (last > typename S::Int(position));
       if (!S::any(reached)) continue;
       const V uncapped = reached ? exp2_lanes<V, M>(reached ? t : zero, T()) : zero;
-      const V alpha = capped<V, T>(uncapped);
+      const V alpha = capped<V, T>(uncapped, further.cap());
       V left = S::load(state.transmittance + at), behind = S::load(state.behind + at);
-      const V gr = S::load(state.color[0] + at), gg = S::load(state.color[1] + at), gb = S::load(state.color[2] + at);
-      V gd = zero;
-      V value = chunk.r[k] * gr + chunk.g[k] * gg + chunk.b[k] * gb;
-      if (kDepth) gd = S::load(state.depth + at), value += chunk.inverse_depth[k] * gd;
-      const V q = uncapped * alpha_gradient<T, V>(alpha, value, left, behind);
+      V gradient[kWidth<kPayload>];
+      for (int c = 0; c < kWidth<kPayload>; ++c) gradient[c] = S::load(state.payload[c] + at);
+      V value = chunk.payload[0][k] * gradient[0];
+      for (int c = 1; c < kWidth<kPayload>; ++c) value += chunk.payload[c][k] * gradient[c];
+      if constexpr (kPayload == kChannels) value = further.value(value, at);
+      V q = uncapped * alpha_gradient<T, V>(alpha, value, left, behind);
+      if constexpr (kPayload == kChannels) q = further.slope(q, uncapped);
       const V weight = alpha * left;
       S::store(state.transmittance + at, left), S::store(state.behind + at, behind);
       moments.add(chunk, k, terms, pixel, q);
-      red += weight * gr, green += weight * gg, blue += weight * gb;
-      if (kDepth) depth += weight * gd;
+      for (int c = 0; c < kWidth<kPayload>; ++c) payload[c] += weight * gradient[c];
+      if constexpr (kPayload == kChannels) further.weigh(at, weight);
     } while ((column += kColumns<T>) < end && RowTable<T, kRays>::kParts == 1);
   }
   const auto& m = moments;
   if constexpr (kRays != kNoRays) {
-    const V all[] = {m.q,  m.u,   m.v,  m.uu, m.uv, m.vv, red,          green,
-                     blue, depth, m.pu, m.pv, m.pp, zero, m.absolute_u, m.absolute_uv};
+    const V all[] = {m.q,        m.u,        m.v,  m.uu, m.uv, m.vv, payload[0],   payload[1],
+                     payload[2], payload[3], m.pu, m.pv, m.pp, zero, m.absolute_u, m.absolute_uv};
     std::copy_n(all, kSums<kRays, kAbsolute>, sums);
   } else {
-    const V all[] = {m.q, m.u, m.v, m.uu, m.uv, m.vv, red, green, blue, depth, m.absolute_u, m.absolute_uv};
+    const V all[] = {m.q,        m.u,        m.v,        m.uu,       m.uv,         m.vv,
+                     payload[0], payload[1], payload[2], payload[3], m.absolute_u, m.absolute_uv};
     std::copy_n(all, kSums<kRays, kAbsolute>, sums);
   }
 }
 
 // Sums one splat's values over the pixels that it reaches, all of them from column `first` to `last`.
-template <class T, int kRays, bool kDepth, bool kAbsolute>
-void splat_gradient(const Batch<T, kRays>& batch, int k, int64_t position, BackwardState<T, kRays>& state, T* out) {
+template <class T, int kRays, int kPayload, bool kAbsolute>
+void splat_gradient(const Batch<T, kRays>& batch, int k, int64_t position, BackwardState<T, kRays>& state,
+                    FurtherSums<T, kPayload>& further, T* out) {
   constexpr int kParts = RowTable<T, kRays>::kParts;
   const int first = batch.columns.first[k], wide = batch.columns.last[k] - first;
   Sums<T, kRays, kAbsolute> sums;
   if (wide < kColumns<T>) {  // one vector a row, which may begin at any column: that changes no sum
     const int begin = std::min(first, kTile - kColumns<T>);
-    sum_rows<T, kRays, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, sums);
+    sum_rows<T, kRays, kPayload, kAbsolute>(batch, k, position, batch.table.rows(k), begin, begin + 1, state, further,
+                                            sums);
   } else {
     const int vectors = wide / kColumns<T> + 1, begin = std::min(first, kTile - vectors * kColumns<T>);
     Sums<T, kRays, kAbsolute> parts[kParts];
     for (int p = 0; p < kParts; ++p) {
       const int from = kParts > 1 ? p * kColumns<T> : begin;
-      sum_rows<T, kRays, kDepth, kAbsolute>(batch, k, position, batch.table.rows(k, p), from,
-                                            begin + vectors * kColumns<T>, state, parts[p]);
+      sum_rows<T, kRays, kPayload, kAbsolute>(batch, k, position, batch.table.rows(k, p), from,
+                                              begin + vectors * kColumns<T>, state, further, parts[p]);
     }
     for (int i = 0; i < kSums<kRays, kAbsolute>; ++i) {
       sums[i] = parts[0][i];
@@ -405,29 +226,32 @@ void read_ends(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& t
   interleave<T>(state.last), interleave<T>(state.transmittance);
 }
 
-template <class T, int kRays>
+template <class T, int kRays, int kPayload>
 void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& tile, int64_t index,
-                BackwardState<T, kRays>& state) {
+                BackwardState<T, kRays>& state, FurtherSums<T, kPayload>& further) {
   const int64_t plane = int64_t(in.image.width) * in.image.height;
-  std::fill_n(state.color[0], 3 * kPixels, T(0));
-  std::fill_n(state.depth, kPixels, T(0));
+  std::fill_n(state.payload[0], kLeading * kPixels, T(0));
   std::fill_n(state.behind, kPixels, T(0));
-  for (int c = 0; c < 3; ++c) read_tile(g.color + c * plane, in.image, tile, state.color[c]);
-  if (g.inverse_depth) read_tile(g.inverse_depth, in.image, tile, state.depth);
+  if (g.inverse_depth) read_tile(g.inverse_depth, in.image, tile, state.payload[3]), interleave<T>(state.payload[3]);
   if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
-  for (int p = 0; p < kPixels; ++p)
-    for (int c = 0; c < 3; ++c) state.behind[p] += in.background[c] * state.color[c][p];
+  for (int64_t c = 0; c < in.planes(); ++c) {
+    T* pixels = c < kLeading ? state.payload[c] : further.plane(c);
+    read_tile(g.color + c * plane, in.image, tile, pixels);
+    for (int p = 0; p < kPixels; ++p) state.behind[p] += in.background[c] * pixels[p];
+    interleave<T>(pixels);
+  }
   read_ends(in, g, tile, index, state);
-  for (T* pixels : {state.behind, state.color[0], state.color[1], state.color[2], state.depth}) interleave<T>(pixels);
+  interleave<T>(state.behind);
 }
 
-template <class T, int kRays, bool kDepth, bool kAbsolute>
+template <class T, int kRays, int kPayload, bool kAbsolute>
 void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t index, int64_t processed,
-                    const GradientRows<T, kSums<kRays, kAbsolute>>& rows) {
+                    const GradientRows<T, kSums<kRays, kAbsolute>>& rows, const PassRows<T>& pass) {
   const Tile tile(index, in.image);
   const int64_t begin = in.ranges[index];
   BackwardState<T, kRays> state;
-  read_state(in, g, tile, index, state);
+  FurtherSums<T, kPayload> further(in.channels);
+  read_state(in, g, tile, index, state, further);
   Batch<T, kRays> batch;
   for (int64_t to = processed; to > 0; to -= std::min<int64_t>(kBatch, to)) {
     const int64_t from = std::max<int64_t>(0, to - kBatch), count = to - from;
@@ -437,8 +261,18 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
     batch.columns.find(batch.chunk, count, state.places);
     batch.table.fill(batch.chunk, count, from, state);
     for (int64_t position = to - 1; position >= from; --position) {
-      T* sums = rows.row(slot_of(g.slots, in.instances[begin + position], tile.x / kTile, tile.y / kTile));
-      splat_gradient<T, kRays, kDepth, kAbsolute>(batch, int(position - from), position, state, sums);
+      const int32_t splat = in.instances[begin + position];
+      const int64_t slot = slot_of(g.slots, splat, tile.x / kTile, tile.y / kTile);
+      const auto sum_into = [&](T* to) {
+        splat_gradient<T, kRays, kPayload, kAbsolute>(batch, int(position - from), position, state, further, to);
+      };
+      if constexpr (kPayload == kChannels) {
+        T sums[kSums<kRays, kAbsolute>];
+        further.start(splat), sum_into(sums);
+        further.store(sums, pass, rows.number(slot), rows.row(slot));
+      } else {
+        sum_into(rows.row(slot));
+      }
     }
   }
 }
@@ -462,15 +296,45 @@ std::vector<int32_t> mark_rows(const Executor& executor, const BlendInput<T>& in
   return processed;
 }
 
+// The passes over channels. values: their gradient, (N, channels), or null.
+template <class T, int kRays, bool kAbsolute>
+void fill_passes(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
+                 const std::vector<int32_t>& processed, const GradientRows<T, kSums<kRays, kAbsolute>>& rows,
+                 T* values) {
+  const auto first_row = [&](int64_t splat) { return rows.number(g.slots[splat].first); };
+  const std::unique_ptr<T[]> channels(values ? new T[kMostChannels * first_row(g.count)] : nullptr);
+  each_pass(in, [&](int64_t first, const BlendInput<T>& pass, int64_t plane) {
+    BlendGradient<T> gradient = g;
+    gradient.color += plane;
+    if (first > 0) gradient.transmittance_gradient = nullptr;
+    for_dynamic(executor, tiles_of(in.image), 1, [&](int64_t tile, int64_t) {
+      blend_tile_vjp<T, kRays, kChannels, kAbsolute>(pass, gradient, tile, processed[tile], rows,
+                                                     {channels.get(), first > 0});
+    });
+    for_dynamic(executor, values ? g.count : 0, 1024, [&](int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) {
+        double sums[kMostChannels] = {};  // a splat may have thousands of tiles
+        for (int64_t row = first_row(i); row < first_row(i + 1); ++row)
+          for (int64_t c = 0; c < pass.channels.count; ++c) sums[c] += channels[kMostChannels * row + c];
+        std::copy_n(sums, pass.channels.count, values + in.channels.count * i + first);
+      }
+    });
+  });
+}
+
 template <class T, int kRays, bool kAbsolute, class Memory>
 GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
-                                                   const BlendGradient<T>& g, const Memory& memory) {
+                                                   const BlendGradient<T>& g, const Memory& memory,
+                                                   T* values = nullptr) {
   GradientRows<T, kSums<kRays, kAbsolute>> rows(g.slot_count);
   const std::vector<int32_t> processed = mark_rows(executor, in, g, rows);
   rows.allocate(memory);
-  const auto run =
-      g.inverse_depth ? blend_tile_vjp<T, kRays, true, kAbsolute> : blend_tile_vjp<T, kRays, false, kAbsolute>;
-  for_dynamic(executor, tiles_of(in.image), 1, [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows); });
+  if constexpr (kRays != kLensRays)
+    if (in.channels.count) return fill_passes<T, kRays, kAbsolute>(executor, in, g, processed, rows, values), rows;
+  const auto run = g.inverse_depth ? blend_tile_vjp<T, kRays, kColorAndDepth, kAbsolute>
+                                   : blend_tile_vjp<T, kRays, kColor, kAbsolute>;
+  for_dynamic(executor, tiles_of(in.image), 1,
+              [&](int64_t tile, int64_t) { run(in, g, tile, processed[tile], rows, {}); });
   return rows;
 }
 
@@ -512,8 +376,8 @@ void sum_gradients(const Executor& executor, const BlendInput<T>& in, const Blen
 template <class T, int kRays, bool kAbsolute>
 void keep_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
                const RowMemory<T>& memory) {
-  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g,
-                                                   [&](int64_t count) { return memory.take(memory.context, count); });
+  const auto take = [&](int64_t count) { return memory.take(memory.context, count); };
+  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g, take, memory.values);
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)
       memory.counts[i] =

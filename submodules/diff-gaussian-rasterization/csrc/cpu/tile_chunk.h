@@ -97,11 +97,17 @@ struct TilePlaces<T, kLensRays> {
   Place<typename Simd<T>::Vec> from(int at, int) const { return {Simd<T>::load(x + at), Simd<T>::load(y + at)}; }
 };
 
+// What splats show: a colour, a colour and an inverse depth, or channels, the first four of which stand in their place.
+enum Payload : int { kColor, kColorAndDepth, kChannels };
+constexpr int kLeading = 4;
+template <int kPayload>
+constexpr int kWidth = kPayload == kColor ? 3 : kLeading;  // of kLeading, what is there
+
 // The values of at most kChunk splats, an array each, as LocalSplat has them, or LocalRaySplat.
 template <class T, int kChunk, int kRays>
 struct Chunk : ChunkOfRays<T, kChunk, kRays> {
   alignas(64) T y[kChunk], l11[kChunk], l12[kChunk], l22[kChunk], u[kChunk], log2_opacity[kChunk];
-  alignas(64) T r[kChunk], g[kChunk], b[kChunk], inverse_depth[kChunk];
+  alignas(64) T payload[kLeading][kChunk];
   alignas(64) T x[kChunk];  // the mean's, in the tile
 
   // The shapes of a vector of splats from k on; no colours.
@@ -141,17 +147,25 @@ struct Chunk : ChunkOfRays<T, kChunk, kRays> {
         const T all[] = {t.u.one, t.u.x, t.u.y, t.v.one, t.v.x, t.v.y, t.s.one, t.s.x, t.s.y};
         for (int i = 0; i < 9; ++i) this->linear[i][k] = all[i];
         l12[k] = splat.l12, l22[k] = splat.l22, log2_opacity[k] = splat.log2_opacity;
-        r[k] = splat.r, g[k] = splat.g, b[k] = splat.b, inverse_depth[k] = splat.inverse_depth;
+        put_payload(k, in, in.instances[begin + k], splat);
         this->slope_u[k] = splat.slope_u, this->slope_v[k] = splat.slope_v, this->e[k] = splat.e;
         continue;
       }
       const T left = unrolled(splat, T(tile.x), in.image.width);
       const auto s = localise(splat, left, T(tile.y));
       y[k] = s.y, l11[k] = s.l11, l12[k] = s.l12, l22[k] = s.l22, u[k] = s.u, log2_opacity[k] = s.log2_opacity;
-      r[k] = s.r, g[k] = s.g, b[k] = s.b, inverse_depth[k] = s.inverse_depth;
+      put_payload(k, in, in.instances[begin + k], splat);
       x[k] = splat.x - left;
       if constexpr (kRays != kNoRays) this->slope_u[k] = s.slope_u, this->slope_v[k] = s.slope_v, this->e[k] = s.e;
     }
+  }
+
+ private:
+  void put_payload(int64_t k, const BlendInput<T>& in, int64_t index, const Splat<T>& splat) {
+    const T color[] = {splat.r, splat.g, splat.b, splat.inverse_depth};
+    const int64_t channels = in.channels.count;
+    for (int c = 0; c < kLeading; ++c)
+      payload[c][k] = !channels ? color[c] : c < channels ? in.channels.of(index)[c] : T(0);
   }
 };
 

@@ -88,9 +88,9 @@ __device__ __forceinline__ Seen walk(const Batch<kPixels, kRays>& batch, const P
   float threshold = front > 0 ? kLeast : INFINITY;
   bool open = __any_sync(kWarp, front > 0);
   for (int from = 0; open && from < count; from += 32) {
-    front_to_back(batch, at, from, count, [&](int k, int, float t) {
-      const bool reached = t >= threshold;
-      const float alpha = capped<float, float>(exp2_device(t));
+    front_to_back(batch, at, from, count, [&](int k, const float (&t)[1]) {
+      const bool reached = t[0] >= threshold;
+      const float alpha = capped<float, float>(exp2_device(t[0]));
       const float after = seen.transmittance - alpha * seen.transmittance;
       const bool ends = reached && front * after < kOpaque, blended = reached && !ends;
       const float4 c = batch.color[k];

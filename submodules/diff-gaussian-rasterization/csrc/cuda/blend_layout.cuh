@@ -176,8 +176,8 @@ __device__ inline unsigned reached_by_warp(const Batch<kCount, kRays>& batch, co
 template <class L>
 constexpr int kTogether = L::kRun == 1 ? 2 : 1;
 
-// Goes front to back through the splats that reach the warp, of 32 from `from`. Calls step(k, p, exponent) for each
-// and for each pixel of the lane.
+// Goes front to back through the splats that reach the warp, of 32 from `from`. Calls step(k, exponents) for each, with
+// those of the lane's pixels.
 template <class L, int kCount, int kRays, class Step>
 __device__ __forceinline__ void front_to_back(const Batch<kCount, kRays>& batch, const L& at, int from, int count,
                                               const Step& step) {
@@ -194,9 +194,7 @@ __device__ __forceinline__ void front_to_back(const Batch<kCount, kRays>& batch,
       for (int p = 0; p < L::kRun; ++p) t[i][p] = exists ? exponent_at(row, at.place(p)) : -INFINITY;
     }
 #pragma unroll
-    for (int i = 0; i < kTogether<L>; ++i)
-#pragma unroll
-      for (int p = 0; p < L::kRun; ++p) step(k[i], p, t[i][p]);
+    for (int i = 0; i < kTogether<L>; ++i) step(k[i], t[i]);
   }
 }
 

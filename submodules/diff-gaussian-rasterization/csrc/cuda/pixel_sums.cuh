@@ -1,5 +1,5 @@
 #pragma once
-// What a splat's gradient sums over the pixels of a lane.
+// What a splat's gradient sums over the pixels of a lane, and over those of a warp.
 #include <type_traits>
 
 #include "blend_layout.cuh"
@@ -61,6 +61,38 @@ __device__ __forceinline__ const LensTerms<float>& terms_of(const LensLocal& spl
 template <int kRays>
 using LaneMoments = std::conditional_t<kRays == kLensRays, LensRowSums,
                                        std::conditional_t<kRays == kNoRays, FlatRowSums, RayRowMoments>>;
+
+// Sums values over a warp, ten of them in 12 shuffles: each step halves those that a lane keeps and doubles the lanes
+// that are summed. The lane ends with the sum of `value`, or with none (-1).
+template <int kCount, int kStep = 16>
+__device__ __forceinline__ float warp_sum(const float (&v)[kCount], int first, int end, int& value) {
+  if constexpr (kStep == 0) {
+    static_assert(kCount == 1, "a warp has 32 lanes");
+    value = first < end ? first : -1;
+    return v[0];
+  } else {
+    constexpr int kHalf = (kCount + 1) / 2;
+    const bool upper = threadIdx.x & kStep;
+    float kept[kHalf];
+#pragma unroll
+    for (int i = 0; i < kHalf; ++i) {
+      const float high = kHalf + i < kCount ? v[kHalf + i] : 0;
+      if constexpr (kCount > 1)
+        kept[i] = (upper ? high : v[i]) + __shfl_xor_sync(kWarp, upper ? v[i] : high, kStep);
+      else  // all lanes keep the sum, of which one alone is said
+        kept[i] = v[i] + __shfl_xor_sync(kWarp, v[i], kStep);
+    }
+    const int middle = first + kHalf;
+    return warp_sum<kHalf, kStep / 2>(kept, upper ? middle : first, upper || middle > end ? end : middle, value);
+  }
+}
+
+template <int kCount>
+__device__ __forceinline__ void warp_sums(const float (&v)[kCount], float* sums) {
+  int value;
+  const float sum = warp_sum(v, 0, kCount, value);
+  if (value >= 0) sums[value] = sum;
+}
 
 }  // namespace cuda
 }  // namespace gs

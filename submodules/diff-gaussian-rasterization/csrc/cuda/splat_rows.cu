@@ -1,4 +1,4 @@
-// Gradient rows by splat: taken from a backward, and put where SlotSums finds them.
+// Gradient rows by splat: summed, taken from a backward, and put where SlotSums finds them.
 #include <thrust/iterator/counting_iterator.h>
 #include <thrust/iterator/transform_iterator.h>
 
@@ -28,6 +28,19 @@ __global__ void __launch_bounds__(kThreads)
   sums.read(i, seen, of_pixels, stage + threadIdx.x / 32 * kStage);
   if (i >= count) return;
   absolute[i] = seen ? absolute_length(splats[row * i + 2], of_pixels[0], of_pixels[1], image) : 0;
+}
+
+template <int kRays>
+__global__ void __launch_bounds__(kThreads)
+    moments_kernel(const int32_t* halted, int64_t count, SlotSums<kRays> sums, float* moments) {
+  if (!begin_work(halted)) return;
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  constexpr int kRow = kGradientRow<kRays>, kStage = SlotSums<kRays>::kStage;
+  __shared__ __align__(8) float stage[kThreads / 32 * kStage];
+  float values[kRow];
+  sums.read(i, i < count && sums.seen(i), values, stage + threadIdx.x / 32 * kStage);
+  if (i >= count) return;
+  for (int v = 0; v < kRow; ++v) moments[kRow * i + v] = values[v];
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -108,6 +121,12 @@ void lay_out(const Queue& queue, const SplatRows<float>& in, SplatSlots* slots, 
   });
 }
 
+template <int kRays>
+void sum_moments(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  const SlotSums<kRays> sums{fill_rows<kRays>(queue, in, g), g.slots};
+  launch(queue, "moments", moments_kernel<kRays>, blocks_for(g.count, kThreads), kThreads, g.count, sums, g.moments);
+}
+
 }  // namespace
 
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<kAbsoluteValues>& sums, const float* splats,
@@ -146,6 +165,14 @@ SlotSums<kRays> sums_of(const Queue& queue, const SplatRows<float>& in, const Ro
 }
 template SlotSums<kNoRays> sums_of<kNoRays>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
 template SlotSums<kPinholeRays> sums_of<kPinholeRays>(const Queue&, const SplatRows<float>&, const RowSums<float>&);
+
+template <>
+void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
+  const auto sum = in.rays == kLensRays ? sum_moments<kLensRays>
+                   : in.rays            ? sum_moments<kPinholeRays>
+                                        : sum_moments<kNoRays>;
+  if (g.count) sum(queue, in, g);
+}
 
 }  // namespace cuda
 }  // namespace gs

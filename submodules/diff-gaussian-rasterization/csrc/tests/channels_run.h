@@ -21,19 +21,23 @@ struct ChannelsRun {
 template <class Where>
 ChannelsRun run_channels(const Where& where, Parameters<float>& p, gs::Image image, int64_t channels, bool absolute,
                          bool stops) {
-  using gs::cuda::blend_channels, gs::cuda::channel_rows, gs::GS_ISA::blend_channels, gs::GS_ISA::channel_rows;
+  using gs::cuda::blend, gs::cuda::blend_rows, gs::GS_ISA::blend, gs::GS_ISA::blend_rows;
   const auto r = bin_scene(where, scene_of(p, image, false), Asked{});
   const size_t pixels = r->pixels();
   std::vector<float> values(p.count * channels), background(channels, 0.2f), planes(channels * pixels, 1.0f / channels);
   for (size_t i = 0; i < values.size(); ++i) values[i] = float(int(i * 7 % 11) - 4) / 5;
-  const gs::Channels<float> shown{values.data(), channels, channels, stops ? 0.9f : 0.99f, stops};
-  const gs::BlendInput<float> in{
-      r->splats.data(), r->instances.data(), r->ranges.data(), background.data(), image, int64_t(r->instances.size()),
-      r->scene.rays()};
+  const gs::BlendInput<float> in{r->splats.data(),
+                                 r->instances.data(),
+                                 r->ranges.data(),
+                                 background.data(),
+                                 image,
+                                 int64_t(r->instances.size()),
+                                 r->scene.rays(),
+                                 nullptr,
+                                 {values.data(), channels, channels, stops ? 0.9f : 0.99f, stops}};
   ChannelsRun out;
   out.color.assign(channels * pixels, NAN), out.transmittance.assign(pixels, NAN), out.last.assign(pixels, -77);
-  blend_channels(where, in, shown,
-                 gs::Blended<float>{out.color.data(), out.transmittance.data(), nullptr, out.last.data(), nullptr});
+  blend(where, in, gs::Blended<float>{out.color.data(), out.transmittance.data(), nullptr, out.last.data(), nullptr});
   const std::vector<float> ones(pixels, 1);
   const gs::BlendGradient<float> g{
       p.count,         in.instance_count, r->slot_count, r->slots.data(), out.transmittance.data(),
@@ -46,7 +50,7 @@ ChannelsRun run_channels(const Where& where, Parameters<float>& p, gs::Image ima
     to.rows.assign(count * to.row, NAN);
     return to.rows.data();
   };
-  channel_rows(where, in, shown, g, gs::RowMemory<float>{take, &out, out.counts.data(), absolute}, out.values.data());
+  blend_rows(where, in, g, gs::RowMemory<float>{take, &out, out.counts.data(), absolute, out.values.data()});
   const size_t filled = out.row * std::accumulate(out.counts.begin(), out.counts.end(), size_t(0));
   CHECK(out.rows.size() >= filled);
   out.rows.resize(filled);

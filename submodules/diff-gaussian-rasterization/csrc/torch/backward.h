@@ -61,14 +61,15 @@ class KeptRows {
   KeptRows(const Tensor& splats, bool absolute)
       : counts(empty<int32_t>({splats.size(0)}, splats)), splats_(splats), absolute_(absolute) {}
 
+  // values: gs::RowMemory::values.
   template <class T>
-  gs::RowMemory<T> memory() {
+  gs::RowMemory<T> memory(T* values = nullptr) {
     const auto take = [](void* context, int64_t count) {
       auto& to = *static_cast<KeptRows*>(context);
       to.rows = empty({count, row_values(to.absolute_, rays_of(to.splats_))}, to.splats_);
       return write<T>(to.rows);
     };
-    return {take, this, write<int32_t>(counts), absolute_};
+    return {take, this, write<int32_t>(counts), absolute_, values};
   }
 
  private:

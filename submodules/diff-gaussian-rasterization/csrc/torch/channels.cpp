@@ -36,8 +36,9 @@ std::tuple<Tensor, Tensor, Tensor> blend_channels_op(const Tensor& splats, const
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
     const gs::Blended<T> out{write<T>(color), write<T>(transmittance), nullptr, write<int32_t>(last), nullptr};
-    GS_RUN(T, rows, blend_channels, blend_input<T>(rows, lists, bounds, bg, image, {}),
-           channels_of<T>(values, cap, false), out);
+    gs::BlendInput<T> in = blend_input<T>(rows, lists, bounds, bg, image, {});
+    in.channels = channels_of<T>(values, cap, false);
+    GS_RUN(T, rows, blend, in, out);
   });
   return {color, transmittance, last};
 }
@@ -60,8 +61,10 @@ std::tuple<Tensor, Tensor, Tensor> channel_rows_op(List<Tensor> source, const Te
   KeptRows kept(splats, absolute);
   with_scalar(splats.scalar_type(), [&](auto zero) {
     using T = decltype(zero);
-    GS_RUN(T, splats, channel_rows, in.input<T>(), channels_of<T>(values, cap, stops), in.gradient<T>(nullptr, {}),
-           kept.memory<T>(), wanted ? write<T>(gradient) : nullptr);
+    gs::BlendInput<T> input = in.input<T>();
+    input.channels = channels_of<T>(values, cap, stops);
+    GS_RUN(T, splats, blend_rows, input, in.gradient<T>(nullptr, {}),
+           kept.memory<T>(wanted ? write<T>(gradient) : nullptr));
   });
   return {kept.rows, kept.counts, gradient};
 }
