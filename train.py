@@ -49,7 +49,7 @@ def train(
     # Write nothing before every input check has passed: a mistyped option must not overwrite a finished model.
     with own_folder(folder := dataset.model_path), records_kept(folder), run.resources:
         writer = prepare_output_and_logger(run.options, **run.entries) if run.group.first else None
-        run.begin(writer, training_report)
+        run.open(writer, training_report)
         run_training(run, standard_observers(run))
 
 

@@ -1,10 +1,10 @@
 """The manual of parts: what a feature adds to a training, in one class, which lies in one file.
 
-A part is a subclass of `Part` in splatting/parts/NAME.py, and a line in splatting/registry.py. The place of that line
-is the part's in the one order of all hooks. No other file names it. Hooks are optional; those that a class does not
-override cost nothing. This module and every NAME.py import nothing heavy, as doctor.py reads them where torch is
-missing: hooks import what they need. A long method lies in a second file beside it, NAME_*.py. Functions for commands
-and other parts are listed by `tools` of splatting/registry.py.
+A part is a subclass of `Part` in splatting/parts/NAME.py, called by NAME in capital words (depth_tv: DepthTv), and a
+line in splatting/registry.py. The place of that line is the part's in the one order of all hooks. No other file names
+it. Hooks are optional; those that a class does not override cost nothing. This module and every NAME.py import nothing
+heavy, as doctor.py reads them where torch is missing: hooks import what they need. A long method lies in a second file
+beside it, NAME_*.py. Functions for commands and other parts are listed by `tools` of splatting/registry.py.
 
 A run (splatting/training/run.py), in the order in which it calls the hooks:
 
@@ -37,10 +37,11 @@ run.schedule which steps of the schedule an iteration stands for
 run.views    the view of an iteration
 run.sizes    the size of a view in an iteration
 run.sleeping which blocks of rows take a step (scene/sleeping.py)
-run.counts   which pixels of a view count in its loss. It may learn by renders, so no step is taken twice, and the host
-             does not run ahead of a GPU.
-run.grown    whether the scene has more photos than the checkpoint was trained on
-run.on_host  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`, `independent`
+run.pixel_filter  which pixels of a view count in its loss. It may learn by renders, so no step is taken twice, and
+             the host does not run ahead of a GPU.
+run.has_new_photos  whether the scene has more photos than the checkpoint was trained on
+run.camera_steps  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`,
+             `independent`
 """
 
 import argparse
@@ -83,9 +84,10 @@ class Options:
 class Needs:
     """What a part asks of the steps. It is data, because a captured step cannot ask anybody while it replays.
 
-    depth: steps that have terms of the part render depth.
-    captured: a captured step may record its terms, which depend on the render and on the view's photo alone. It tells
-        of no terms then, so `measured` finds none in `losses.terms`.
+    depth: steps that have terms of the part render depth, `package["depth"]`, which is None otherwise.
+    captured: a captured step may record its terms, which depend on the render and on the view's photo alone, so not on
+        the iteration: a recorded weight never changes. `terms` is then asked with a placeholder that has a camera, and
+        `measured` finds nothing in `losses.terms`.
     ranks: it works with several processes.
     files: it reads files of the scene besides photos.
     resets: strategies may reset opacities, so that renders turn dark, though nobody has told them how often.
@@ -230,25 +232,30 @@ class Part:
 
 
 class Strategy(Part):
-    """A part of which each training has one, `run.density`: how many Gaussians there are, and where (--strategy NAME).
+    """A part of which each training has one, `run.strategy`: how many Gaussians there are, and where (--strategy NAME).
 
     It joins a run once it is chosen, which may be late: `check` and `begin` are called then, when the model has its
     optimiser, and all hooks after them.
-    summary: of what it does, for the help. until: the option of the step at which it ends, and the part of the schedule
-    that this is by default. removes: whether it removes Gaussians down to a given number. grows_to: whether it is meant
-    to reach max_gaussians; not where nobody has given a number, with default_is_limit. clamps: whether the loss takes
-    renders clamped to [0, 1], as the reference's does; then Gaussians brighter than white cost nothing before a white
-    background. fusable: whether it needs no gradient besides the statistics. Steps are then taken by
-    training/steps/fused.py, which does not call `after_backward`. It asks `observes`, and in iterations that `changes`
-    names it asks `replaced` and calls `before_step`. It counts only where the class itself says so: a subclass may want
-    more. queues: whether `after_step` queues operators that change the model; it queues nothing else, unless the
-    iteration is one that `changes` names.
+    summary: of what it does, for the help.
+    until: the option of the step at which it ends, and the part of the schedule that this is by default.
+    removes: whether it removes Gaussians down to a given number.
+    grows_to: whether it is meant to reach max_gaussians; not where nobody gives a number, with default_is_limit.
+    clamps: whether the loss takes renders clamped to [0, 1], as the reference's does; then Gaussians brighter than
+        white cost nothing before a white background.
+    fusable: whether it needs no gradient besides the statistics. Steps are then fused (training/steps/fused.py). These
+        never call `after_backward`; they ask `observes`, and where `changes` says so `skips_step`, and then call
+        `change_rows`. It counts only where the class itself says so: a subclass may want more.
+    queues: whether `after_step` queues operators that change the model; it queues nothing else, unless the iteration is
+        one that `changes` names.
 
-    Of a run, set in `begin`: max_gaussians: how many it lets there be, 0: any number. ends: the iteration of the
-    schedule from which it changes no rows. penalty: a part of the loss besides the objective, of which steps add the
-    gradients (scene/gaussians/penalty.py); no loss that is told has it. absolute_gradients: whether the statistics take
-    the lengths of absolute gradients (Ye et al. 2024). schedule: tells how far it is in an iteration
-    (training/schedule.py). Rules that are windows of the schedule ask it; rules that count steps take the iteration.
+    Of a run, set in `begin`:
+    max_gaussians: how many it lets there be, 0: any number.
+    ends: the iteration of the schedule from which it changes no rows.
+    penalty: a part of the loss besides the objective, of which steps add the gradients (scene/gaussians/penalty.py). No
+        loss that is told has it.
+    absolute_gradients: whether the statistics take the lengths of absolute gradients (Ye et al. 2024).
+    schedule: tells how far it is in an iteration (training/schedule.py). Rules that are windows of the schedule ask it;
+        rules that count steps take the iteration.
     """
 
     summary: ClassVar[str] = ""
@@ -301,8 +308,8 @@ class Strategy(Part):
         """Whether all opacities are reset in this iteration."""
         return False
 
-    def replaced(self, iteration: int) -> Collection[str]:
-        """Attributes that `before_step` will give other values or rows, so that they take no step in this iteration.
+    def skips_step(self, iteration: int) -> Collection[str]:
+        """Attributes that `change_rows` will give other values or rows, so that they take no step in this iteration.
 
         Asked, where the step is fused, before anything of the iteration changes the model. Every rank must call it.
         """
@@ -324,11 +331,11 @@ class Strategy(Part):
         return None
 
     def after_backward(self, at: "Iteration", package: dict[str, Any]) -> None:
-        """Called with the gradients computed, before the optimiser's step. package: the result of `render`."""
-        self.before_step(at)
+        """Called with all gradients computed, before Adam. Plain steps only. package: the result of `render`."""
+        self.change_rows(at)
 
-    def before_step(self, at: "Iteration") -> None:
-        """Change what `replaced` tells of, once the view counts in the statistics."""
+    def change_rows(self, at: "Iteration") -> None:
+        """Change what `skips_step` tells of, once the view counts in the statistics."""
 
 
 class Appearance(Part):

@@ -59,7 +59,7 @@ MAY = {
     "render.render_sets": MODEL,
     "splatting.evaluation.error_curve.continue_curve": MODEL,
     "splatting.evaluation.stages._remove_stop": MODEL,
-    "splatting.training.run.begin": MODEL,
+    "splatting.training.run.open": MODEL,
     "splatting.parts.resume.opened": MODEL,
     "splatting.parts.resume.ended": MODEL,
     "splatting.parts.resume._continued": MODEL,

@@ -32,18 +32,18 @@ class Kernels(Part):
         self._calls = {name: getattr(band, name) for name in _PACKING}
         self.milliseconds: dict[str, float] = {}
 
-    def due(self, step: Iteration) -> bool:
+    def due(self, at: Iteration) -> bool:
         return False
 
-    def begins(self, step: Iteration) -> None:
-        if step.iteration == self._first:
+    def begins(self, at: Iteration) -> None:
+        if at.iteration == self._first:
             _wait()
             for name, call in self._calls.items():
                 setattr(band, name, record_function(name)(call))
             self._profile.start()
 
-    def stepped(self, step: Iteration) -> None:
-        if step.iteration == self._first + self._count - 1:
+    def stepped(self, at: Iteration) -> None:
+        if at.iteration == self._first + self._count - 1:
             _wait()
             self._profile.stop()
             for name, call in self._calls.items():

@@ -62,9 +62,9 @@ class WorkloadRun(Run):
         self.objective, self.losses = Objective(self), LossWatch()
         self.log, self.rows, self.first_done = SimpleNamespace(seconds_before=0.0), [], None
         self.watch = DivergenceWatch(self)
-        self.density = strategy_part("adc")
-        self.density.begin(self, None)
-        self.parts = [*self.parts, self.density]
+        self.strategy = strategy_part("adc")
+        self.strategy.begin(self, None)
+        self.parts = [*self.parts, self.strategy]
         if sleep:
             sort_rows(self.gaussians)
             self.sleeping = Sleeping(self.gaussians)
@@ -82,7 +82,7 @@ class WorkloadRun(Run):
         gaussians.training_setup(self.opt)
         gaussians.limit_columns()
 
-    def begin(self) -> None:
+    def open(self) -> None:
         """Say what is spilled, and start the clocks; nothing is written."""
         room = self.gaussians.room
         if room.host_bytes(len(self.gaussians)):

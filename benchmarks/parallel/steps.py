@@ -62,16 +62,16 @@ class Timing(Part):
         self._ends: list[float] = []
         self.peak_mib = 0.0  # before the last step
 
-    def due(self, step: Iteration) -> bool:
+    def due(self, at: Iteration) -> bool:
         return False
 
-    def begins(self, step: Iteration) -> None:
-        if step.last:
+    def begins(self, at: Iteration) -> None:
+        if at.last:
             self.peak_mib = peak_memory_mib(self._device) or 0.0
 
-    def stepped(self, step: Iteration) -> None:
-        done = step.iteration - self._first
-        if done >= 0 and done % _BLOCK == 0 and step.iteration <= self._until:
+    def stepped(self, at: Iteration) -> None:
+        done = at.iteration - self._first
+        if done >= 0 and done % _BLOCK == 0 and at.iteration <= self._until:
             if self._device.type == "cuda":
                 torch.cuda.synchronize(self._device)
             self._ends.append(time.perf_counter())
@@ -108,7 +108,7 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
         torch.cuda.reset_peak_memory_stats()
     timing = Timing(device, case["warm_up"], timed)
     profiled = [Kernels(timed + 1, _BLOCK)] * case["kernels"]
-    run.begin()
+    run.open()
     run_training(run, [run.watch, timing, *profiled])
     near, far = bytes_of()
     peaks = timing.peak_mib, peak_memory_mib(device) or 0.0

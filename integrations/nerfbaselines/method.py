@@ -70,8 +70,8 @@ class _Losses(Part):
 
     reads_model = False
 
-    def due(self, step: Iteration) -> bool:
-        return step.last or step.iteration % INTERVAL == 0
+    def due(self, at: Iteration) -> bool:
+        return at.last or at.iteration % INTERVAL == 0
 
 
 class GaussianSplatting(Method):
@@ -116,7 +116,7 @@ class GaussianSplatting(Method):
         info = scene_of(dataset, StartOptions(model.init_pcd_path, model.init_type))
         with in_place_of_files(info, folder / "scene") as model.source_path:
             self._run = run = Run(*self._options, launch)
-        run.begin()
+        run.open()
         guards = [run.watch, MaskWatch(run.scene.getTrainCameras()), _Losses()]
         self._steps = training_steps(run, guards)
         self._pause = ExitStack()

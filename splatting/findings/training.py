@@ -50,7 +50,7 @@ def check_native(options: argparse.Namespace) -> None:
 
 def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[Finding]:
     """Warnings before a run (splatting/training/run.py). given: the optimisation options as they were given."""
-    density, opt, count, done = run.density, run.opt, run.gaussians.gaussian_count, run.first_iteration
+    density, opt, count, done = run.strategy, run.opt, run.gaussians.gaussian_count, run.first_iteration
     expected = expected_count(density.max_gaussians, count)
     sure = min(count, density.max_gaussians or count)
     found = (

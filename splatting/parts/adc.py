@@ -74,7 +74,7 @@ class Adc(Strategy):
         step = self.schedule.schedule_step(iteration)
         return self._actions(iteration).reset_opacity and not self._ends_too_soon(step, iteration)
 
-    def replaced(self, iteration: int) -> Collection[str]:
+    def skips_step(self, iteration: int) -> Collection[str]:
         if self._actions(iteration).densify:
             return self._gaussians._attributes
         return ["opacity"] if self.resets(iteration) else ()
@@ -83,9 +83,9 @@ class Adc(Strategy):
         if self.observes(at.iteration):
             observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
             observe(package["viewspace_points"], package["radii"])
-        self.before_step(at)
+        self.change_rows(at)
 
-    def before_step(self, at: "Iteration") -> None:
+    def change_rows(self, at: "Iteration") -> None:
         todo = self._actions(at.iteration)
         if todo.densify:
             self.densify(at.iteration, todo.limit_size)

@@ -55,7 +55,7 @@ class Depths(Part):
         from utils.general_utils import get_expon_lr_func
 
         self._schedule, opt = run.schedule, run.opt
-        self._unit = 1 / run.gaussians.enlargement  # of inverse depths where they are drawn, in the world's
+        self._unit = 1 / run.gaussians.enlargement  # so that the loss is that of depths as they are drawn
         ends = opt.depth_l1_weight_init, opt.depth_l1_weight_final
         self._weight = get_expon_lr_func(*ends, max_steps=opt.iterations)
 

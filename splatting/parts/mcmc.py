@@ -106,7 +106,7 @@ class Mcmc(Strategy):
             count = max(count, self._grown(count, iteration))
         return count
 
-    def replaced(self, iteration: int) -> Collection[str]:
+    def skips_step(self, iteration: int) -> Collection[str]:
         """All, unless there is nothing to do: then the Gaussians take their step."""
         from splatting.parts.mcmc_rules import is_alive
 
@@ -118,7 +118,7 @@ class Mcmc(Strategy):
         moves = moves or gaussians.shards.ranks.anyone(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
-    def before_step(self, at: "Iteration") -> None:
+    def change_rows(self, at: "Iteration") -> None:
         if self.changes(at.iteration):
             self._relocate(at.iteration)
             self._grow(at.iteration)

@@ -28,7 +28,7 @@ class MorePhotos(Part):
         found = new_photos(run)
         if found:
             self._refuse_folder(run)
-            fill(run, "grown", True, self)
+            fill(run, "has_new_photos", True, self)
             added = Added.at(run.first_iteration, run.schedule.ends, found, run.views.cameras)
             print(f"{len(found)} photos are new; until iteration {added.until} every second one trains on one of them")
         else:

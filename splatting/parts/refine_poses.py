@@ -53,7 +53,7 @@ class RefinePoses(Part):
         self.poses = PoseRefinement(run.scene, run.dataset.source_path, run.opt.iterations)
         if run.start:
             self.poses.restore(state)
-        fill(run, "on_host", self.poses, self)
+        fill(run, "camera_steps", self.poses, self)
 
     def ready(self, run: Any) -> None:
         """Only now cameras leave where they were when a new training began, as other parts have measured them."""

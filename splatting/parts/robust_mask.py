@@ -40,11 +40,11 @@ class RobustMask(Part):
         self.residuals = Residuals(run.scene.getTrainCameras(), run.opt.robust_mask, run.device)
         if state is not None:
             self.residuals.restore(state)
-        fill(run, "counts", self, self)
+        fill(run, "pixel_filter", self, self)
 
     def mask(self, at: "Iteration", image: "Tensor", target: "Tensor", mask: "Tensor | None") -> "Tensor | None":
         """Pixels that count in a step, of those of a mask; after a reset of opacities, residuals teach nothing."""
-        learns = not self._run.density.recovers(at.iteration)
+        learns = not self._run.strategy.recovers(at.iteration)
         return self.residuals.mask(at.camera, image, target, mask, learns)
 
     def counted(self, camera: "Camera") -> "Tensor | None":

@@ -48,7 +48,7 @@ class Spill(Part):
         fill(self._model, "room", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
 
     def ready(self, run: Any) -> None:
-        self._model.room.expect(-(-run.density.max_gaussians // run.group.size), run.scene)
+        self._model.room.expect(-(-run.strategy.max_gaussians // run.group.size), run.scene)
 
     def opened(self, run: Any) -> None:
         announce(run, self._model.room)
@@ -73,7 +73,7 @@ def announce(run: Any, memory: "GpuMemory") -> None:
     from scene.sampling_rate import share_of
     from splatting.findings.resources import expected_count
 
-    now, most, size = run.gaussians.gaussian_count, run.density.max_gaussians, run.group.size
+    now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size
     later = expected_count(most, now)
     if far := memory.host_bytes(-(-later // size)):
         _announce_host(run.scene.images, far, f"{later:,} Gaussians", size)

@@ -31,8 +31,8 @@ class TrainingPage:
         self._run = run
         self._page = Page(run.launch.viewer, run.scene, run.pipe, run.dataset.white_background, run.scene.halves)
         self._requests = self._page.requests
-        if run.counts:
-            self._page.frames.masks = run.counts.counted
+        if run.pixel_filter:
+            self._page.frames.masks = run.pixel_filter.counted
         with self._page.tabs.add_tab("Training"):
             self._tab = TrainingTab(self._page.server, self._requests)
         if run.launch.paused:
@@ -42,66 +42,66 @@ class TrainingPage:
         self._numbers = (0.0, 0, 0.0)  # when they were shown, the iteration, and its seconds of training
         self._step: Iteration | None = None
 
-    def due(self, step: Iteration) -> bool:
+    def due(self, at: Iteration) -> bool:
         self._wish = None
         if self._page.watchers.any:
-            wish = self._page.watchers.next(step.iteration)
+            wish = self._page.watchers.next(at.iteration)
             if wish is not None and self.budget.allows(MOVING if wish.urgent else STILL):
                 self._wish = wish
         return self._wish is not None or self._requests.any
 
-    def stepped(self, step: Iteration) -> None:
-        self._step = step
-        if step.due and not step.stopping and (self._wish is not None or self._requests.any):
+    def stepped(self, at: Iteration) -> None:
+        self._step = at
+        if at.due and not at.stopping and (self._wish is not None or self._requests.any):
             with self._run.clock.paused("viewing"):
-                self._act(step)
+                self._act(at)
         if self._page.watchers.any and time.perf_counter() - self._numbers[0] >= _NUMBERS_EVERY:
-            self._show_numbers(step.iteration)
+            self._show_numbers(at.iteration)
 
-    def _act(self, step: Iteration) -> None:
+    def _act(self, at: Iteration) -> None:
         if self._wish is not None:
-            self._draw(self._wish, step.iteration)
-        if self._requests.any and not step.last:
-            self._obey(step)
+            self._draw(self._wish, at.iteration)
+        if self._requests.any and not at.last:
+            self._obey(at)
 
     def _draw(self, wish: Wish, version: int) -> None:
         began = time.perf_counter()
         self._page.fulfil(wish, version)
         self.budget.spent(began, time.perf_counter() - began)
 
-    def _obey(self, step: Iteration) -> None:
+    def _obey(self, at: Iteration) -> None:
         """Do what was asked for, and return when the training is to go on, or with `step.stopping` set."""
         run, requests = self._run, self._requests
         if requests.paused:
-            self._show_numbers(step.iteration, paused=True)
+            self._show_numbers(at.iteration, paused=True)
         while True:
             if requests.stopped or run.interrupt.requested:
-                step.stopping = run.interrupt.requested or KeyboardInterrupt("stopped from the page")
-                self._run.checkpoints.save(step)
+                at.stopping = run.interrupt.requested or KeyboardInterrupt("stopped from the page")
+                self._run.checkpoints.save(at)
                 return
             if requests.take_checkpoint():
-                self._save(step)
+                self._save(at)
             if requests.take_crop():
                 self._page.export_crop()
             if not requests.paused or requests.take_step():
                 return
-            wish = self._page.watchers.next(step.iteration)
+            wish = self._page.watchers.next(at.iteration)
             if wish is None:
                 self._page.watchers.wait(_WAIT)
             else:
-                self._draw(wish, step.iteration)
+                self._draw(wish, at.iteration)
 
-    def _save(self, step: Iteration) -> None:
+    def _save(self, at: Iteration) -> None:
         """Save a checkpoint. A disk that is full is told, and ends nothing."""
         try:
-            self._run.checkpoints.save(step)
+            self._run.checkpoints.save(at)
         except UserError as error:
             if not isinstance(error.__cause__, OSError):  # such as a loss that is not finite
                 raise
             tqdm.write(f"warning: {error}", file=sys.stderr)
             self._page.notify("Not saved", str(error), color="red")
         else:
-            self._page.notify("Saved", f"chkpnt{step.iteration}.pth")
+            self._page.notify("Saved", f"chkpnt{at.iteration}.pth")
 
     def _show_numbers(self, iteration: int, paused: bool = False) -> None:
         run, now = self._run, time.perf_counter()

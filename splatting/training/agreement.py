@@ -77,12 +77,12 @@ class StepAgreement(Part):
             group.flag = None if guard is None else guard.stopped
         self._asked: type[KeyboardInterrupt] | None = None
 
-    def begins(self, step: Iteration) -> None:
-        self._group.post(int(step.due), _SIGNALS.index(self._interrupt.requested))
+    def begins(self, at: Iteration) -> None:
+        self._group.post(int(at.due), _SIGNALS.index(self._interrupt.requested))
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         due, signal = self._group.heard()
-        step.due = bool(due)
+        at.due = bool(due)
         self._asked = _SIGNALS[signal]
 
     @property

@@ -30,7 +30,7 @@ class Losses(NamedTuple):
 
 @dataclass(slots=True)
 class Iteration:
-    """One iteration, counted from 1. Run.iterations makes it; later change only `due` to `stopping`."""
+    """One iteration, counted from 1. Run.iterations makes it; the last five fields are set while it runs."""
 
     iteration: int
     last: bool  # nothing comes after it, so it takes no step
@@ -39,7 +39,7 @@ class Iteration:
     changes: bool  # rows of the Gaussians, the SH degree, the size of views or the 3D filter change in this iteration
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
-    rests: bool = False  # it was the last one, before the training was continued
+    rests: bool = False  # an earlier run ended with it, and took no step
     terms: dict[str, Term] = field(default_factory=dict)  # that parts add to the loss, weights included
     captured: bool = True  # a captured step may record the terms
     wants_depth: bool = False  # its loss needs the rendered depth

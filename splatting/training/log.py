@@ -36,24 +36,24 @@ class ProgressBar(Part):
         form = {"bar_format": BY_CLOCK} if run.schedule.by_clock else {}
         self._bar = Bar(initial=first, total=run.schedule.length, desc="Training progress", dynamic_ncols=True, **form)
 
-    def due(self, step: Iteration) -> bool:
-        shown = step.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
-        return step.last or shown
+    def due(self, at: Iteration) -> bool:
+        shown = at.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
+        return at.last or shown
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         for name, term in losses.terms.items():
-            self._shown.setdefault(f"{name.capitalize()} Loss", LossWatch()).add(step.iteration, term)
-        if not step.due:
+            self._shown.setdefault(f"{name.capitalize()} Loss", LossWatch()).add(at.iteration, term)
+        if not at.due:
             return
         for loss in self._shown.values():
             loss.read()
         means = {name: f"{loss.mean:.7f}" for name, loss in self._shown.items()}
-        if step.span.stop - 1 != step.iteration:  # the bar counts iterations of the schedule
-            means["Iterations"] = f"{step.iteration:,}"
+        if at.span.stop - 1 != at.iteration:  # the bar counts iterations of the schedule
+            means["Iterations"] = f"{at.iteration:,}"
         # As text: tqdm would round the number to three digits.
         self._bar.set_postfix(means, Gaussians=f"{self._run.gaussians.gaussian_count:,}", refresh=False)
-        self._bar.update(step.span.stop - 1 - self._bar.n)
-        self._updated, self._done = time.monotonic(), step.iteration
+        self._bar.update(at.span.stop - 1 - self._bar.n)
+        self._updated, self._done = time.monotonic(), at.iteration
 
     def ended(self, error: Error) -> None:
         self._bar.close()
@@ -82,10 +82,10 @@ class Summary(Part):
         self._psnr: float | None = None
         self._iteration = run.first_iteration
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        self._iteration = step.iteration
-        if step.last:
-            scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == step.iteration]
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        self._iteration = at.iteration
+        if at.last:
+            scored = [row["test_psnr"] for row in whole_sets(self._run.rows) if row["iteration"] == at.iteration]
             self._psnr = scored[0] if scored else None
 
     def ended(self, error: Error) -> None:
@@ -106,18 +106,18 @@ class Records(Part):
         self._run = run
         self._seconds = 0.0
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         run = self._run
-        if step.record is None and step.scored_at is None:
+        if at.record is None and at.scored_at is None:
             return
         added = {name: number for add in overrides(run.parts, "records") for name, number in add().items()}
-        if step.record is None and not added:
+        if at.record is None and not added:
             return
-        self._seconds = seconds = run.clock.seconds if step.scored_at is None else step.scored_at
+        self._seconds = seconds = run.clock.seconds if at.scored_at is None else at.scored_at
         with run.clock.paused("saving"):
-            values = (step.record or {}) | added
+            values = (at.record or {}) | added
             values |= {"gaussians": run.gaussians.gaussian_count, "loss": run.losses.mean}
-            run.log.add(step.iteration, seconds, run.clock.joules, **values)
+            run.log.add(at.iteration, seconds, run.clock.joules, **values)
 
     def ended(self, error: Error) -> None:
         """Note how the training was planned, what to try next, and the seconds of this process by their purpose."""
@@ -125,7 +125,7 @@ class Records(Part):
             return
         run, log, opt = self._run, self._run.log, self._run.opt
         options = {PLANNED: opt.iterations, STRATEGY: opt.strategy}
-        if not run.density.grows_to:
+        if not run.strategy.grows_to:
             budget = default_budget(run.scene.getTrainCameras())
             options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
         log.note(**options)

@@ -27,7 +27,7 @@ def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
 
     Every gradient of every parameter is there for whoever wants it: objectives, strategies and hooks of others.
     """
-    gaussians, density, options = run.gaussians, run.density, run.render_options(at)
+    gaussians, strategy, options = run.gaussians, run.strategy, run.render_options(at)
     _prepare_rows(run, at)  # all of them, unless blocks of rows sleep (scene/sleeping.py)
     package = render(at.camera, gaussians, run.pipe, at.background, **options)
     planes = _planes(package, run)
@@ -40,10 +40,10 @@ def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
         return plain_step(run, at, tell)
     if planes and at.steps:
         _step_camera(run, at, planes)  # a view's pose and lens, where they are trained
-    if any(density.penalty):
-        gaussians.penalise(density.penalty)  # a part of the loss that no render shows
+    if any(strategy.penalty):
+        gaussians.penalise(strategy.penalty)  # a part of the loss that no render shows
     tell.measured(at, losses)  # progress, scores and saves of the model as it was rendered
-    density.after_backward(at, package)  # statistics; clone, split, prune, reset opacities
+    strategy.after_backward(at, package)  # statistics; clone, split, prune, reset opacities
     if at.steps:  # as in the reference, the last iteration takes no step
         gaussians.step(package["radii"])  # Adam
         run.after_step(at)
@@ -160,7 +160,7 @@ class Announcer:
 
 def _planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
     """Image and depth before exposures, which keep their gradients for the step of a camera; empty without one."""
-    if not run.on_host:
+    if not run.camera_steps:
         return []
     planes = [package["render"], package["depth"]]
     for plane in planes:
@@ -172,13 +172,13 @@ def _planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
 def _step_camera(run: Run, at: Iteration, planes: list[Tensor | None]) -> None:
     color, depth = (None if plane is None else plane.grad for plane in planes)
     drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
-    run.step_on_host(at, drawn.camera_gradient(color, in_world_units(depth, run.gaussians)))
+    run.step_camera(at, drawn.camera_gradient(color, in_world_units(depth, run.gaussians)))
 
 
 def _prepare_rows(run: Run, at: Iteration) -> None:
     """Place a trained camera, and wake the blocks that the step concerns: all, where rows change or nothing follows."""
-    if run.on_host:
-        run.on_host.place(at.camera)
+    if run.camera_steps:
+        run.camera_steps.place(at.camera)
     if not run.sleeping:
         return
     if at.changes or not at.steps:

@@ -25,29 +25,29 @@ class Objective:
         """run: of splatting/training/run.py."""
         self._run = run
 
-    def takes_bands(self, step: Iteration) -> bool:
+    def takes_bands(self, at: Iteration) -> bool:
         """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
-        return not self.terms(step) and step.camera.counts_all_pixels and step.camera.columns is None
+        return not self.terms(at) and at.camera.counts_all_pixels and at.camera.columns is None
 
-    def terms(self, step: Iteration) -> dict[str, Term]:
+    def terms(self, at: Iteration) -> dict[str, Term]:
         """What a step adds to the photometric loss, weights included, by name."""
-        return step.terms
+        return at.terms
 
-    def __call__(self, package: dict[str, Any], step: Iteration) -> Losses:
+    def __call__(self, package: dict[str, Any], at: Iteration) -> Losses:
         """package: of `render`, with `depth` where the step wants it.
 
         Gradients are valid only inside a `band`.
         """
-        camera = step.camera
-        target, mask = camera.ground_truth(step.background)
-        image, weight, clamp = package["render"], self._run.opt.lambda_dssim, self._run.density.clamps
+        camera = at.camera
+        target, mask = camera.ground_truth(at.background)
+        image, weight, clamp = package["render"], self._run.opt.lambda_dssim, self._run.strategy.clamps
         if (band := package.get("band")) is not None:
             total, l1 = photometric_loss_by_bands(image, target, weight, *band, clamp)
             return Losses(total, l1, terms={}, mask=None)
-        if (counts := self._run.counts) is not None:
-            mask = counts.mask(step, image.detach(), target, mask)
+        if (pixels := self._run.pixel_filter) is not None:
+            mask = pixels.mask(at, image.detach(), target, mask)
         total, l1 = photometric_loss(image, target, weight, mask, camera.columns, clamp)
-        further = {name: term(package, mask) for name, term in self.terms(step).items()}
+        further = {name: term(package, mask) for name, term in self.terms(at).items()}
         return Losses(sum(further.values(), start=total), l1, further, mask)
 
 

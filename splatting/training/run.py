@@ -55,12 +55,12 @@ class Run:
     Options: dataset, opt, pipe, launch. Made by them: scene, gaussians, views (by iteration), objective, density,
     schedule, background (3,), parts in their order. group: the processes that train together. start: a chkpntN.pth that
     is resumed, or None; first_iteration: done before this run.
-    sleeping, sizes, counts, on_host, grown: slots that parts fill (splatting/part.py).
+    sleeping, sizes, pixel_filter, camera_steps, has_new_photos: slots that parts fill (splatting/part.py).
     interrupt: a signal that asks the loop to stop; an observer that waits has to check it. resources: what parts have
     open, closed when the training is over, however it ends. warnings: what was warned of.
-    log, rows (of the curve so far), losses (running mean of the total), clock (seconds of training): `begin` starts
+    log, rows (of the curve so far), losses (running mean of the total), clock (seconds of training): `open` starts
     them, or continues those of the run that is resumed. watch: ends a training that diverges. checkpoints: writes them.
-    writer, report: of `begin`. first_done: seconds from the process's start to the end of its first iteration; None:
+    writer, report: of `open`. first_done: seconds from the process's start to the end of its first iteration; None:
     the system does not say.
     """
 
@@ -104,7 +104,7 @@ class Run:
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
         check_views(self.pipe, self.scene.getTestCameras())
         self._check_records()
-        self.density = self._choose_strategy(states)
+        self.strategy = self._choose_strategy(states)
         self.objective = Objective(self)
         self.warnings = [f"warning: {text}" for text in warnings_of(self, given)]
         for text in self.warnings:
@@ -112,7 +112,7 @@ class Run:
         for ready in self.each("ready"):
             ready(self)
         if capture is None and first is None:
-            self.density.started()
+            self.strategy.started()
         self._prepare_records()
 
     def _fill_slots(self) -> None:
@@ -121,11 +121,11 @@ class Run:
         self._hooks: dict[str, list[Callable]] = {}
         self.sleeping: Sleeping | None = None
         self.sizes: Any = OwnSize()
-        self.counts = self.on_host = None
-        self.grown = False
+        self.pixel_filter = self.camera_steps = None
+        self.has_new_photos = False
 
     def _prepare_records(self) -> None:
-        """Those of a new training, which `begin` opens or continues."""
+        """Those of a new training, which `open` continues."""
         self.log, self.clock, self.losses = TrainingLog(self.scene.model_path), Stopwatch(), LossWatch()
         self.rows: list[Row] = []
         self.watch, self.checkpoints = DivergenceWatch(self), Checkpoints(self)
@@ -197,7 +197,7 @@ class Run:
         saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
         folder.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
         if start:
-            folder.report_changes(start, self.options, self.grown)
+            folder.report_changes(start, self.options, self.has_new_photos)
 
     @property
     def _all_options(self) -> argparse.Namespace:
@@ -220,7 +220,7 @@ class Run:
         found = {name: fact for facts in self.each("facts") for name, fact in facts().items()}
         return found | ({ENTRY: self._orientation} if self._orientation else {})
 
-    def begin(self, writer: Any = None, report: Callable | None = None) -> None:
+    def open(self, writer: Any = None, report: Callable | None = None) -> None:
         """Write the inputs into the output folder, print the memory estimate, and start the clock.
 
         report: `training_report`, or what replaces it; writer: its first argument.
@@ -231,7 +231,7 @@ class Run:
             self.scene.write_inputs()
         if self.group.first and not self.schedule.paced:
             (Path(to) / SCHEDULE).unlink(missing_ok=True)
-        wants = self.density.max_gaussians, self.density.absolute_gradients
+        wants = self.strategy.max_gaussians, self.strategy.absolute_gradients
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = folder.continue_records(to, start, self.first_iteration)
         self.losses.mean = self.log.loss
@@ -270,7 +270,7 @@ class Run:
 
         What an objective or a strategy says of itself is not inherited; subclasses opt in.
         """
-        own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.density))
+        own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.strategy))
         return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
 
     def iterations(self) -> Iterator[Iteration]:
@@ -280,7 +280,7 @@ class Run:
             schedule.reach(iteration, self.log.seconds_before + seconds)
             camera = self.sizes.view(self.views[iteration], schedule.schedule_step(iteration))
             span, last = schedule.span(iteration), schedule.is_last(iteration)
-            step = Iteration(
+            at = Iteration(
                 iteration,
                 last=last,
                 rests=schedule.rests(iteration),
@@ -290,20 +290,20 @@ class Run:
                 started=seconds,
                 span=range(span.start, schedule.length + 1) if last else span,
             )
-            self.add_terms(step)
-            yield step
+            self.add_terms(at)
+            yield at
             if iteration == self.first_iteration + 1:
                 self.first_done = seconds_since_start()
-            if step.last:
+            if at.last:
                 return
 
-    def add_terms(self, step: Iteration) -> None:
+    def add_terms(self, at: Iteration) -> None:
         """Add what parts add to the loss of a step."""
         for terms in self.each("terms"):
-            if found := terms(step):
-                step.terms |= found
-                step.wants_depth |= terms.__self__.needs.depth
-                step.captured &= terms.__self__.needs.captured
+            if found := terms(at):
+                at.terms |= found
+                at.wants_depth |= terms.__self__.needs.depth
+                at.captured &= terms.__self__.needs.captured
 
     def _changes(self, iteration: int) -> bool:
         changes = any(changes(iteration) for changes in self.each("changes"))
@@ -320,26 +320,26 @@ class Run:
         draws = uniform(self.opt.seed, Stream.BACKGROUND, iteration, torch.zeros(1, dtype=torch.int64))
         return draws[0, :3].to(self.device)
 
-    def prepare(self, step: Iteration) -> None:
+    def prepare(self, at: Iteration) -> None:
         """Set learning rates and SH degree, and begin to decode the photos of the next views."""
-        self.set_rates(step)
-        for _ in range(self._raises_degree(step.iteration)):
+        self.set_rates(at)
+        for _ in range(self._raises_degree(at.iteration)):
             self.gaussians.oneupSHdegree()
             self.gaussians.limit_columns()
-        if step.iteration - 1 == self.launch.debug_from:
+        if at.iteration - 1 == self.launch.debug_from:
             self.pipe.debug = True
-        self.decode_ahead(step.iteration)
+        self.decode_ahead(at.iteration)
 
-    def set_rates(self, step: Iteration) -> None:
+    def set_rates(self, at: Iteration) -> None:
         """Set the learning rates of a step, which may be one that is repeated."""
-        self.gaussians.exposures.held = self.density.recovers(step.iteration)
-        self.gaussians.update_learning_rate(self.schedule.schedule_step(step.iteration))
-        factor = self.schedule.rate_factor(step.iteration)
+        self.gaussians.exposures.held = self.strategy.recovers(at.iteration)
+        self.gaussians.update_learning_rate(self.schedule.schedule_step(at.iteration))
+        factor = self.schedule.rate_factor(at.iteration)
         if factor is None:
-            factor = self.density.rate_factor(step.iteration)
+            factor = self.strategy.rate_factor(at.iteration)
         if factor is not None:
             sparse = self.opt.optimizer_type == "sparse_adam"
-            self.gaussians.scale_rates(factor * (bias_correction(step.iteration) if sparse else 1.0))
+            self.gaussians.scale_rates(factor * (bias_correction(at.iteration) if sparse else 1.0))
 
     def decode_ahead(self, iteration: int) -> None:
         """Begin to decode the photos of an iteration and of those that follow it."""
@@ -348,16 +348,16 @@ class Run:
             ahead = min(ahead, last - iteration + 1)
         self.scene.prefetch(list(filter(self.sizes.needs, self.views.coming(iteration, ahead))))
 
-    def step_on_host(self, step: Iteration, gradient: Tensor) -> None:
+    def step_camera(self, at: Iteration, gradient: Tensor) -> None:
         """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
-        at = self.schedule.schedule_step(step.iteration)
-        self.on_host.step(step.camera.uid, gradient.cpu().numpy(), at)
-        self.on_host.place()
+        step = self.schedule.schedule_step(at.iteration)
+        self.camera_steps.step(at.camera.uid, gradient.cpu().numpy(), step)
+        self.camera_steps.place()
 
-    def after_step(self, step: Iteration) -> None:
+    def after_step(self, at: Iteration) -> None:
         """What follows the optimiser's step."""
         for after_step in self.each("after_step"):
-            after_step(step)
+            after_step(at)
 
     def flushed_view(self) -> AbstractContextManager:
         """Within it, others may read the model."""
@@ -369,13 +369,13 @@ class Run:
             self.sleeping.flush()
         self.sleeping = None
 
-    def render_options(self, step: Iteration) -> dict[str, bool]:
+    def render_options(self, at: Iteration) -> dict[str, bool]:
         """Options of `render` that make it compute what this step's loss needs, and no more."""
         return {
-            "want_depth": step.wants_depth,
+            "want_depth": at.wants_depth,
             "want_visibility": False,
             "want_inactive_bands": False,
-            "want_absolute_gradient": self.density.absolute_gradients and self.density.observes(step.iteration),
+            "want_absolute_gradient": self.strategy.absolute_gradients and self.strategy.observes(at.iteration),
             "clamp": False,
         }
 

@@ -25,27 +25,27 @@ class Saves(Part):
         self._run = run
         self._left_out: TrimReport | None = None
 
-    def due(self, step: Iteration) -> bool:
-        return step.takes(self._run.launch.save_iterations)
+    def due(self, at: Iteration) -> bool:
+        return at.takes(self._run.launch.save_iterations)
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        if not step.takes(self._run.launch.save_iterations):
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        if not at.takes(self._run.launch.save_iterations):
             return
         run = self._run
-        step.record = step.record or {}
+        at.record = at.record or {}
         with run.clock.paused("saving"):
-            run.gaussians.check_finite(step.iteration)
-            tqdm.write(f"[ITER {step.iteration}] Saving Gaussians", file=sys.stdout)
-            if step.last:
+            run.gaussians.check_finite(at.iteration)
+            tqdm.write(f"[ITER {at.iteration}] Saving Gaussians", file=sys.stdout)
+            if at.last:
                 # Then the test photos are in memory, and scoring them once more costs little.
-                scored = step.scored_at is not None or run.opt.iterations in run.launch.test_iterations
-                self._left_out = run.save_last(step.iteration, scored)
-                step.record |= {"gaussians_left_out": self._left_out.unseen}
+                scored = at.scored_at is not None or run.opt.iterations in run.launch.test_iterations
+                self._left_out = run.save_last(at.iteration, scored)
+                at.record |= {"gaussians_left_out": self._left_out.unseen}
                 return
             count = run.gaussians.gaussian_count
-            if run.group.first and (text := little_space(run, count, count, step.iteration)):
+            if run.group.first and (text := little_space(run, count, count, at.iteration)):
                 tqdm.write(f"warning: {text}", file=sys.stderr)
-            run.scene.save(step.iteration)
+            run.scene.save(at.iteration)
 
     def ended(self, error: Error) -> None:
         if error is None and self._left_out is not None:
@@ -61,26 +61,26 @@ class Checkpoints(Part):
     def __init__(self, run: "Run") -> None:
         self._run = run
 
-    def due(self, step: Iteration) -> bool:
-        return step.takes(self._run.launch.checkpoint_iterations)
+    def due(self, at: Iteration) -> bool:
+        return at.takes(self._run.launch.checkpoint_iterations)
 
-    def stepped(self, step: Iteration) -> None:
-        if step.stopping or step.takes(self._run.launch.checkpoint_iterations):
-            self.save(step)
+    def stepped(self, at: Iteration) -> None:
+        if at.stopping or at.takes(self._run.launch.checkpoint_iterations):
+            self.save(at)
 
-    def save(self, step: Iteration, name: str = "") -> None:
+    def save(self, at: Iteration, name: str = "") -> None:
         """Write a checkpoint after an iteration that is due, and say how to resume if the training stops.
 
         name: of the file, chkpntN.pth if it is empty.
         """
         run = self._run
-        run.watch.check(step.iteration)
-        path = write_checkpoint(run, step.iteration, name, with_ply=bool(step.stopping))
-        if step.stopping:
-            look = f"Look at the model: {view_command(run.scene.model_path, step.iteration)}"
+        run.watch.check(at.iteration)
+        path = write_checkpoint(run, at.iteration, name, with_ply=bool(at.stopping))
+        if at.stopping:
+            look = f"Look at the model: {view_command(run.scene.model_path, at.iteration)}"
             early = ", before its learning rates fell" if run.schedule.by_clock else ""
             resume = f"Resume by the same command with --start_checkpoint {path}"
-            tqdm.write(f"Stopped at iteration {step.iteration}{early}\n{look}\n{resume}", file=sys.stderr)
+            tqdm.write(f"Stopped at iteration {at.iteration}{early}\n{look}\n{resume}", file=sys.stderr)
 
 
 def write_checkpoint(run: "Run", iteration: int, name: str = "", with_ply: bool = False) -> Path:

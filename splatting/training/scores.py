@@ -32,24 +32,24 @@ class Scores(Part):
         self._run = run
         self._planned = run.launch.test_iterations
 
-    def due(self, step: Iteration) -> bool:
-        return self._run.report is not training_report or step.takes(self._planned)
+    def due(self, at: Iteration) -> bool:
+        return self._run.report is not training_report or at.takes(self._planned)
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        if not self.due(step):
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        if not self.due(at):
             return
-        run, seconds = self._run, self._run.clock.seconds - step.started
+        run, seconds = self._run, self._run.clock.seconds - at.started
         with run.clock.paused("scoring"):
-            if step.takes(self._planned):
+            if at.takes(self._planned):
                 run.scene.prefetch(run.scene.getTestCameras())
             l1, total = torch.stack((losses.l1, losses.total)).detach().cpu()
-            tested = [step.iteration if t in step.span else -1 for t in self._planned]
+            tested = [at.iteration if t in at.span else -1 for t in self._planned]
             scores = run.report(
-                run.writer, step.iteration, l1, total, l1_loss, seconds, tested,
+                run.writer, at.iteration, l1, total, l1_loss, seconds, tested,
                 run.scene, render, (run.pipe, run.background), run.scene.halves,
             )  # fmt: skip
         if scores:
-            step.record = (step.record or {}) | scores
+            at.record = (at.record or {}) | scores
 
 
 def training_report(

@@ -41,11 +41,11 @@ class DivergenceWatch(Part):
         self._earliest: list[float] = []
         self._latest: deque[float] = deque(maxlen=_COMPARED)
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        self._losses.add(step.iteration, losses.total)
-        self._guard.watch(step.iteration, losses.total)
-        if step.due:
-            self.check(step.iteration)
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        self._losses.add(at.iteration, losses.total)
+        self._guard.watch(at.iteration, losses.total)
+        if at.due:
+            self.check(at.iteration)
 
     def check(self, iteration: int) -> None:
         """Save the model with a checkpoint, and raise UserError, if a loss or a step was not finite.
@@ -114,10 +114,10 @@ class MaskWatch(Part):
         self._scanty: list[str] = []
         self._seen = 0
 
-    def measured(self, step: Iteration, losses: Losses) -> None:
-        self.add(step.camera, losses.mask)
-        if step.due:
-            self.check(step.last)
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        self.add(at.camera, losses.mask)
+        if at.due:
+            self.check(at.last)
 
     def add(self, view: Camera, mask: Tensor | None) -> None:
         """Note the share of pixels that count in a view seen for the first time."""

@@ -251,8 +251,8 @@ def test_ranks(scene, tmp_path, once):
 @pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, "--strategy", "mcmc"), False)])
 def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
     monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
-    found, begin = [], run.Run.begin
-    monkeypatch.setattr(run.Run, "begin", lambda self, *x: (found.append(self.sleeping is not None), begin(self, *x)))
+    found, begin = [], run.Run.open
+    monkeypatch.setattr(run.Run, "open", lambda self, *x: (found.append(self.sleeping is not None), begin(self, *x)))
     trained(scene, tmp_path, *options)
     assert found == [sleeps]
 

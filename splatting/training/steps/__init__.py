@@ -14,5 +14,5 @@ def faster_steps(run: Run) -> FasterSteps:
     if not FusedStep.suits(run):
         return FasterSteps()
     exchanges = run.gaussians.shards.ranks.several  # numbers, in each step
-    runs_ahead = run.device.type == "cuda" and not exchanges and run.counts is None
+    runs_ahead = run.device.type == "cuda" and not exchanges and run.pixel_filter is None
     return CapturedStep(run) if runs_ahead else FusedStep(run)

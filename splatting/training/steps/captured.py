@@ -28,7 +28,9 @@ class CapturedStep(FusedStep):
         self._ahead = Speculation(run.device, self)
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
         pinned = run.device.type == "cuda"
-        self._rows = torch.zeros(ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.on_host else None
+        self._rows = (
+            torch.zeros(ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.camera_steps else None
+        )
         self._fetched: dict[int, _Fetched] = {}  # by iteration: of cameras that have yet to step
 
     def take(self, at: Iteration, tell: Tell) -> bool:
@@ -51,7 +53,7 @@ class CapturedStep(FusedStep):
     def throttle(self, at: Iteration) -> None:
         if self._is_queued(at):
             self._ahead.throttle()
-            if host := self._run.on_host:
+            if host := self._run.camera_steps:
                 most = host.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
                 self._ahead.wait(most)
                 self._step_on_host(min(most, AHEAD))
@@ -62,8 +64,8 @@ class CapturedStep(FusedStep):
     def drain(self) -> None:
         self._ahead.drain()
         self._step_on_host(0)
-        if self._run.on_host:
-            self._run.on_host.place()
+        if self._run.camera_steps:
+            self._run.camera_steps.place()
 
     def abort(self) -> None:
         self._ahead.abort()
@@ -79,12 +81,12 @@ class CapturedStep(FusedStep):
 
     def _queue(self, at: Iteration) -> Losses | None:
         """Queue a step. Returns its losses, or None if these have further terms."""
-        run, density = self._run, self._run.density
+        run, strategy = self._run, self._run.strategy
         losses = self._graphs.launch(at)
         if losses is not None:
             self._fetch(at)
             flushes = run.sleeping is not None and run.sleeping.flushes(at.iteration)
-            queues = density.queues or run.gaussians.exposures.applied or flushes
+            queues = strategy.queues or run.gaussians.exposures.applied or flushes
             with self._ahead.capacity(at) if queues else nullcontext():
                 run.gaussians.exposures.step()
                 run.after_step(at)
@@ -119,7 +121,7 @@ class CapturedStep(FusedStep):
             if fetched.copied is not None:
                 fetched.copied.synchronize()
             step = self._run.schedule.schedule_step(iteration)
-            self._run.on_host.step(fetched.uid, fetched.gradient.numpy(), step)
+            self._run.camera_steps.step(fetched.uid, fetched.gradient.numpy(), step)
 
     # What speculation asks for, of steps that are done or overflowed
 

@@ -21,16 +21,16 @@ class FusedStep(FasterSteps):
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.on_host else None
+        pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.camera_steps else None
         self.camera_gradient = pose  # of the last step
-        self._adam = FusedAdam(run.gaussians, run.density.penalty)
+        self._adam = FusedAdam(run.gaussians, run.strategy.penalty)
         self._bands = KnownBands()
         self._is_known = False  # whether the model is one that the operator steps
         self._has_parameter_terms = False
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether nobody else needs gradients. Foreign objectives and density controls may, and some options do."""
+        """Whether nobody else needs gradients. Foreign objectives and strategy controls may, and some options do."""
         return run.is_standard and not (run.launch.plain_step or torch.is_anomaly_enabled())
 
     def take(self, at: Iteration, tell: Tell) -> bool:
@@ -43,7 +43,7 @@ class FusedStep(FasterSteps):
         self.advance(at, drawn, gradients)
         del drawn, gradients  # what changes rows needs their memory
         if self.camera_gradient is not None and at.steps:
-            self._run.step_on_host(at, self.camera_gradient)
+            self._run.step_camera(at, self.camera_gradient)
         self.follow(at)
         return True
 
@@ -65,8 +65,8 @@ class FusedStep(FasterSteps):
     def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
         """Render: what was drawn, the losses, and their gradients of image and depth. now: as for `Drawn.step`."""
         run = self._run
-        if run.on_host and now is None:
-            run.on_host.place(at.camera)
+        if run.camera_steps and now is None:
+            run.camera_steps.place(at.camera)
         whole = at.changes or not at.steps  # all blocks wake, as in a plain step
         if whole and run.sleeping:
             run.sleeping.flush()
@@ -101,20 +101,20 @@ class FusedStep(FasterSteps):
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:
         """Take the step of the Gaussians, as far as they take one, and add the view to the statistics."""
-        gaussians, density = self._run.gaussians, self._run.density
-        adam, steps, observes = self._adam, at.steps, density.observes(at.iteration)
+        gaussians, strategy = self._run.gaussians, self._run.strategy
+        adam, steps, observes = self._adam, at.steps, strategy.observes(at.iteration)
         if not at.steps or at.changes:
-            left_out = density.replaced(at.iteration) if at.steps else gaussians._attributes
+            left_out = strategy.skips_step(at.iteration) if at.steps else gaussians._attributes
             steps = len(left_out) < len(gaussians._attributes)
-            adam = FusedAdam(gaussians, density.penalty, left_out)
+            adam = FusedAdam(gaussians, strategy.penalty, left_out)
         if steps or observes or self.camera_gradient is not None:
-            drawn.step(adam, *gradients, observes, density.absolute_gradients, camera=self.camera_gradient)
+            drawn.step(adam, *gradients, observes, strategy.absolute_gradients, camera=self.camera_gradient)
 
     def follow(self, at: Iteration) -> None:
         """Change rows, where it is time to, and take the step of the exposures."""
         run = self._run
         if at.changes:
-            run.density.before_step(at)
+            run.strategy.change_rows(at)
         if at.steps:  # as in the reference, the last iteration takes no step
             run.gaussians.exposures.step()
             run.after_step(at)

@@ -2,7 +2,7 @@
 
 These are the camera, the photo, Adam's constants and the iteration. The host fills them by a copy. A graph is good for
 one kind of step (size and angle of the image, SH degree, statistics or not) until the Gaussians' tensors are replaced,
-as density control does, or their lists outgrow its capacity (training/steps/speculative.py).
+as strategy control does, or their lists outgrow its capacity (training/steps/speculative.py).
 """
 
 from collections.abc import Callable, Hashable
@@ -94,7 +94,7 @@ class Graphs:
         """Forget the graphs if something that they took for fixed has changed."""
         run, optimizer = self._run, self._run.gaussians.optimizer
         columns = optimizer.active_columns("f_rest")
-        used = run.objective, run.density, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
+        used = run.objective, run.strategy, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
         used = *used, run.sizes.factor, run.sleeping and run.sleeping.awake.data_ptr()
         baked = self._adam.places(), used
         if baked != self._baked:
@@ -118,7 +118,7 @@ class Graphs:
         """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
         camera, run = at.camera, self._run
         held = run.gaussians.exposures.applied and run.gaussians.exposures.held
-        phase = run.density.observes(at.iteration), run.gaussians.active_sh_degree, held
+        phase = run.strategy.observes(at.iteration), run.gaussians.active_sh_degree, held
         size = camera.image_height, camera.image_width, camera.FoVx, camera.FoVy
         kind = (*size, camera.lens, str(camera.columns), *at.terms, *phase)
         graph = self._graphs.get(kind)
@@ -194,14 +194,14 @@ class Graphs:
             run.gaussians.exposures.optimizer.zero_grad(set_to_none=False)
         drawn, losses, gradients = self._fused.measure(placeholder, now)
         run.gaussians.guard_loss(iteration, losses.total)
-        density = run.density
-        observed = density.observes(iteration), density.absolute_gradients
+        strategy = run.strategy
+        observed = strategy.observes(iteration), strategy.absolute_gradients
         drawn.step(self._adam, *gradients, *observed, now, self._fused.camera_gradient)
         return torch.stack([losses.total, losses.l1])
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:
         """The camera's numbers (35,) on the host, read from the GPU once; those of a trained pose never lie there."""
-        if host := self._run.on_host:
+        if host := self._run.camera_steps:
             host.place(camera)
             return camera.numbers[:_CAMERA]
         tensors = camera.world_view_transform, camera.full_proj_transform, camera.camera_center
