@@ -71,7 +71,7 @@ def options_of(group: str) -> "list[Option]":
 
 
 EXPOSURES = "exposures"  # the model's own key of what an appearance has trained
-# Of states in checkpoints of version 0.2 and before.
+# Of states in checkpoints before 0.3.
 _OLD_KEYS = {
     "asleep": "sleep",
     "best": "keep_best",  # which is gone, and refused by this name
