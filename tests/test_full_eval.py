@@ -625,3 +625,15 @@ def test_a_gpu_that_is_not_there_is_refused(evaluate, monkeypatch, count, senten
     with pytest.raises(UserError, match=sentence):
         evaluate("attic", "--gpus", 0 if count == 0 else 1, 2)
     assert not evaluate.out.exists()
+
+
+def test_views_without_a_psnr_are_on_no_sheet(tmp_path):
+    """Equal images have none, and other option sets may have none of other views."""
+    (tmp_path / "model").mkdir()
+    scores = {"results": {"SSIM": 0.5, "PSNR": 20.0}, "per_view": {"PSNR": dict.fromkeys(("00000.png", "00001.png"))}}
+    for name, found in scores.items():
+        (tmp_path / "model" / f"{name}.json").write_text(json.dumps({"ours_30": found}))
+    views = ComparedViews([{"config": None, "model": "model", "final_iteration": 30}], tmp_path)
+    with pytest.raises(UserError, match="no view has a PSNR"):
+        views.draw_worst(tmp_path / "sheet.png")
+    assert views.shown(3) == []
