@@ -42,8 +42,9 @@ FLOORS = (
     ("utils",),
     ("splatting.files",),
     ("splatting.distributed",),
+    ("splatting.deterministic",),
     ("splatting.host",),
-    ("splatting", "splatting.deterministic"),
+    ("splatting",),
 )
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 

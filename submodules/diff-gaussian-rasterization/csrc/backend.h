@@ -62,6 +62,8 @@ struct RowMemory {
 // Compiled once: see gs/rounded.h.
 void observe(const Executor&, const ObserveInput&);
 void displace(const Executor&, const Displacement&);
+void elementary(const Executor&, const Elementary&);
+void random_words(const Executor&, const RandomInput&);
 // How many records each block of splats has: (bands + 1, record_blocks), last those of all bands.
 void count_records(const Executor&, const RecordInput&, int32_t* counts);
 template <class T>
@@ -96,6 +98,8 @@ namespace cuda {
 GS_BACKEND(Queue)
 void observe(const Queue&, const ObserveInput&);
 void displace(const Queue&, const Displacement&);
+void elementary(const Queue&, const Elementary&);
+void random_words(const Queue&, const RandomInput&);
 void count_records(const Queue&, const RecordInput&, int32_t* counts);
 void list_records(const Queue&, const RecordInput&, const RecordLists<float>&);
 void sum_runs(const Queue&, const SumInput<float>&);
@@ -120,6 +124,6 @@ void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, c
 void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* sums);
 void sum_blocks(const Queue&, int64_t blocks, int64_t numbers, const double* sums, double* out);
 }  // namespace cuda
-using cuda::observe, cuda::displace, cuda::count_records;
+using cuda::observe, cuda::displace, cuda::elementary, cuda::random_words, cuda::count_records;
 
 }  // namespace gs

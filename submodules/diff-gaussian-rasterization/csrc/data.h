@@ -285,6 +285,23 @@ struct Displacement {
   int64_t first = 0;                 // index of the first one where there are no items
 };
 
+// A function of each number (math/portable.h).
+struct Elementary {
+  int64_t count;
+  const double* values;
+  double* out;
+  bool logarithm;  // else an exponential
+};
+
+// Four random words for each item (math/random.h).
+struct RandomInput {
+  int64_t count;
+  const int64_t* items;
+  int64_t* out;  // (count, 4)
+  uint64_t seed = 0;
+  uint32_t draw = 0, iteration = 0, stream = 0;
+};
+
 // Which splats reach which bands of rows of tiles. A record is a splat for a band that it reaches.
 struct RecordInput {
   int64_t count;

@@ -76,6 +76,15 @@ def penalise_(
     _penalise(logits, log_scales, logit_gradients, log_scale_gradients, opacity, scale)
 
 
+def random_words(items: Tensor, *, seed: int, stream: int, iteration: int, draw: int = 0) -> Tensor:
+    """Four random numbers below 2^32 for each of (n,) int64 items below 2^32: (n, 4) int64.
+
+    Philox-4x32-10 (Salmon et al. 2011) of item, draw, iteration and stream, each below 2^32, by the seed's lower 64
+    bits. Every device and number of threads gives the same bits.
+    """
+    return OPERATORS.random_words(items, _signed(seed), stream, iteration, draw)
+
+
 def _signed(seed: int) -> int:
     """The lower 64 bits of a seed as the operators take them."""
     return (seed + 2**63) % 2**64 - 2**63

@@ -525,6 +525,28 @@ void test_displacements() {
     }
 }
 
+// Exponentials, logarithms and random words have the CPU's bits.
+void test_elementary() {
+  for (const int64_t n : {0, 1, 255, 700}) {
+    std::vector<double> values;
+    std::vector<int64_t> items;
+    for (int64_t i = 0; i < n; ++i) values.push_back(std::abs(normal()) * 30), items.push_back(i * 6700417);
+    gs::emulation::Memory memory;
+    const gs::Queue queue = memory.queue();
+    const gs::Executor cpu = gs::serial_executor();
+    for (const bool logarithm : {false, true}) {
+      std::vector<double> wanted(n), got(n);
+      gs::elementary(cpu, gs::Elementary{n, values.data(), wanted.data(), logarithm});
+      gs::cuda::elementary(queue, gs::Elementary{n, values.data(), got.data(), logarithm});
+      CHECK(got == wanted);
+    }
+    std::vector<int64_t> wanted(4 * n), got(4 * n);
+    gs::random_words(cpu, gs::RandomInput{n, items.data(), wanted.data(), 1ull << 40, 1, 600, 2});
+    gs::cuda::random_words(queue, gs::RandomInput{n, items.data(), got.data(), 1ull << 40, 1, 600, 2});
+    CHECK(got == wanted);
+  }
+}
+
 // Checks something on a queue of its own, in every order of the threads.
 template <class Check>
 void in_every_order(const Check& check) {
@@ -924,6 +946,7 @@ int main() {
                          test_records,
                          test_steps,
                          test_displacements,
+                         test_elementary,
                          test_runs,
                          test_runs_that_do_not_fit,
                          test_given_covariances_and_colors,
