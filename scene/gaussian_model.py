@@ -5,6 +5,7 @@ import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -23,6 +24,9 @@ from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from splatting.part import Strategy
 
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
@@ -130,6 +134,19 @@ class GaussianModel(ReferenceNames, GaussianParameters):
             max_steps=training_args.position_lr_max_steps,
         )
         self.exposures.training_setup(training_args)
+
+    def follow(self, strategy: "Strategy") -> None:
+        """Step as a strategy asks for, with the averages that there are. An optimiser of other code stays."""
+        self._rates["f_rest"] *= strategy.band_rate
+        old = self.optimizer
+        if type(old) in _OPTIMIZERS.values():
+            kind = SparseGaussianAdam if strategy.seen_only else type(old)
+            groups = (
+                {"params": g["params"], "lr": self._rates[g["name"]], "name": g["name"]} for g in old.param_groups
+            )
+            self.optimizer = kind([*groups])
+            self.optimizer.state.update(old.state)
+            self.limit_columns()
 
     def update_learning_rate(self, iteration: int) -> float:
         """Set the scheduled learning rates for this iteration; return that of the positions."""

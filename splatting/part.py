@@ -247,6 +247,8 @@ class Strategy(Part):
         `change_rows`. It counts only where the class itself says so: a subclass may want more.
     queues: whether `after_step` queues operators that change the model; it queues nothing else, unless the iteration is
         one that `changes` names.
+    seen_only: whether a step concerns only what the view sees, as with --optimizer_type sparse_adam.
+    band_rate: factor of the learning rate of SH bands above degree 0.
 
     Of a run, set in `begin`:
     max_gaussians: how many it lets there be, 0: any number.
@@ -266,6 +268,8 @@ class Strategy(Part):
     clamps: ClassVar[bool] = True
     fusable: ClassVar[bool] = False
     queues: ClassVar[bool] = False
+    seen_only: ClassVar[bool] = False
+    band_rate: ClassVar[float] = 1.0
     max_gaussians = 0
     ends = math.inf
     penalty: Any = ()
@@ -328,6 +332,10 @@ class Strategy(Part):
 
     def rate_factor(self, iteration: int) -> float | None:
         """Factor of the learning rates that have no schedule, where the run's schedule has none. None: 1."""
+        return None
+
+    def beta2(self, iteration: int) -> float | None:
+        """Decay of Adam's averages of squared gradients. None: the optimiser's."""
         return None
 
     def after_backward(self, at: "Iteration", package: dict[str, Any]) -> None:

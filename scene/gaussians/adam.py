@@ -190,6 +190,12 @@ class GaussianAdam(torch.optim.Adam):
             if state := self.state.get(group["params"][0]):
                 state["step"] = (state["step"] - steps).clamp_min(0)
 
+    def set_beta2(self, beta2: float) -> None:
+        """Take another decay of the averages of squared gradients from the next step on."""
+        self.defaults["betas"] = self.defaults["betas"][0], beta2
+        for group in self.param_groups:
+            group["betas"] = self.defaults["betas"]
+
     def active_columns(self, name: str) -> int:
         """The number of columns that step (`set_active_columns`), -1: all of them."""
         return self._active_columns.get(name, -1)

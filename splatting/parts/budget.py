@@ -1,11 +1,11 @@
 """Growth to a given number of Gaussians, where the training views' error is.
 
 After the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and the
-long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even, which
-was no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight
-over several views, and nothing else counts. Gaussians are drawn by their scores without
-replacement, not the highest taken. Children keep their parent's mean and covariance. Opacities are multiplied by a
-factor, where Rota Bulo et al. subtract a constant.
+long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even, which was
+no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight over several
+views, and nothing else counts. Gaussians are drawn by their scores without replacement, not the highest taken. Children
+keep their parent's mean and covariance. Opacities are multiplied by a factor, where Rota Bulo et al. subtract a
+constant. Adam averages squared gradients over fewer iterations, and SH bands learn twice as fast.
 """
 
 import math
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from scene.cameras import Camera
     from splatting.training.iteration import Iteration
 
+SQUARES = 0.005  # 1 - beta2 of Adam in USUAL iterations; the paper has 0.001
+LEAST_AVERAGED = 16  # iterations, over which squared gradients are averaged in any case
 SCORED_VIEWS = 10  # at most, drawn anew in each densification
 ITERATIONS_A_SCORE = 5  # at least, of a scored view
 
@@ -40,6 +42,7 @@ class Budget(Strategy):
     removes = True
     fusable = True
     clamps = False
+    band_rate = 2.0
     # fmt: off
     options = Options(optimisation=(
         Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
@@ -67,6 +70,11 @@ class Budget(Strategy):
         """Learning rates follow the number of iterations, and fall at the end."""
         length = self.schedule.length
         return longer_steps(USUAL / length, iteration / length)
+
+    def beta2(self, iteration: int) -> float:
+        """Fewer iterations average over fewer of them, by the root of their number as their steps are longer."""
+        stride = self.schedule.stride(iteration) * USUAL / self.schedule.length
+        return 1.0 - min(SQUARES * math.sqrt(stride), 1 / LEAST_AVERAGED)
 
     def changes(self, iteration: int) -> bool:
         in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter

@@ -70,6 +70,7 @@ def announce(run: Any, memory: "GpuMemory") -> None:
     Warn if the host has too little for what is expected.
     """
     from scene import sleeping
+    from scene.gaussians.adam import GaussianAdam
     from scene.sampling_rate import share_of
     from splatting.findings.resources import expected_count
 
@@ -80,7 +81,7 @@ def announce(run: Any, memory: "GpuMemory") -> None:
     count = -(-max(now, most) // size)
     if memory.host_bytes(count):
         share = share_of(run.scene, run.device)
-        dense = run.sleeping is None and run.opt.optimizer_type == "default"
+        dense = run.sleeping is None and type(run.gaussians.optimizer) is GaussianAdam
         same = run.sleeping is None or share < sleeping.MOST_SHARE  # blocks would sleep in any case
         print("\n".join(sentences(memory, count, 1.0 if dense else share, same)))
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from arguments import add_to_model_json, write_cfg_args
 from gaussian_renderer.rays import check_views
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
 from scene.scene import Scene
@@ -189,6 +190,8 @@ class Run:
         check_together(self.parts, self._all_options, self.group.several)
         strategy.check(self, states.get(strategy.name))
         strategy.begin(self, states.get(strategy.name))
+        if strategy.seen_only or strategy.band_rate != 1:
+            self.gaussians.follow(strategy)
         return strategy
 
     def _check_records(self) -> None:
@@ -310,7 +313,12 @@ class Run:
         return self._raises_degree(iteration) > 0 or changes
 
     def _raises_degree(self, iteration: int) -> int:
-        """How often the SH degree is raised in an iteration."""
+        """How often the SH degree is raised in an iteration, in a steady run also where it cannot rise further.
+
+        All blocks of rows wake then, which decides how values of rows that sleep are rounded.
+        """
+        if self.schedule.paced and self.gaussians.active_sh_degree == self.gaussians.max_sh_degree:
+            return 0
         before, now = (self.schedule.schedule_step(t) // SH_INTERVAL for t in (iteration - 1, iteration))
         return now - before
 
@@ -338,8 +346,12 @@ class Run:
         if factor is None:
             factor = self.strategy.rate_factor(at.iteration)
         if factor is not None:
-            sparse = self.opt.optimizer_type == "sparse_adam"
+            sparse = isinstance(self.gaussians.optimizer, SparseGaussianAdam)
             self.gaussians.scale_rates(factor * (bias_correction(at.iteration) if sparse else 1.0))
+        if (beta2 := self.strategy.beta2(at.iteration)) is not None and isinstance(
+            self.gaussians.optimizer, GaussianAdam
+        ):
+            self.gaussians.optimizer.set_beta2(beta2)
 
     def decode_ahead(self, iteration: int) -> None:
         """Begin to decode the photos of an iteration and of those that follow it."""

@@ -77,7 +77,7 @@ def test_the_start_is_more_opaque_and_smaller_than_the_points(colmap_scene, tmp_
 
 
 def test_a_scene_that_fades_is_refused(colmap_scene, tmp_path):
-    with pytest.raises(UserError, match="above 0.9 in iteration 20: .*lower --mcmc_opacity_reg"):
+    with pytest.raises(UserError, match="above 0.9 in iteration 40: .*lower --mcmc_opacity_reg"):
         _train(colmap_scene, tmp_path, "--mcmc_min_opacity", 0.9)
 
 

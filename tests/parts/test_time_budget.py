@@ -425,7 +425,7 @@ def test_a_decided_run_goes_through_rates_degrees_and_windows(colmap_scene, tmp_
     expected = [0.01 ** ((step - steps[0]) / 4000) for step in steps[:-1]]
     assert [rate / rates[1] for rate in rates[1:]] == pytest.approx(expected, rel=1e-6)
     # All in the window, as every fifth would be too few; and where the SH degree is raised.
-    assert [t for t, change in enumerate(changes, 1) if change] == [*range(6, 25), 32, 40]
+    assert [t for t, change in enumerate(changes, 1) if change] == [*range(6, 25), 32]
     assert [t for t in range(1, 40) if degrees[t] > degrees[t - 1]] == [13, 24, 32]  # after 1000, 2000 and 3000
 
 

@@ -1,0 +1,146 @@
+"""How much each constant of --strategy budget matters: test PSNR with it halved and doubled, all others unchanged.
+
+    python -m benchmarks.scenes.sensitivity SCENE ... --gpus 0 0 1 1 -- --schedule 8200 --max_num_splats 250000
+
+Words after -- go to train.py. With --schedule, trainings may run beside each other; with --time_budget, one on each
+GPU. Differences are between trainings of the same seed: mean and standard error.
+"""
+
+import argparse
+import contextlib
+import importlib
+import io
+import multiprocessing
+import os
+import statistics
+import sys
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from benchmarks.harness.measuring import describe, print_table
+from splatting.evaluation.error_curve import NAME, read_curve
+from utils.system_utils import run_cli
+
+OPTIONS = (
+    *("position_lr_init", "position_lr_final", "feature_lr", "opacity_lr", "scaling_lr", "rotation_lr"),
+    *("densification_interval", "densify_from_iter", "densify_until_iter", "prune_opacity", "opacity_decay"),
+)
+FROM_ONE = ("opacity_decay", "SETTLING")  # whose distance from 1 is halved and doubled
+ATTRIBUTES = {
+    "Budget.band_rate": "splatting.parts.budget",
+    "SQUARES": "splatting.parts.budget",
+    "LONGER": "splatting.training.schedule",
+    "MOST_RATE": "splatting.training.schedule",
+    "SETTLING": "splatting.training.schedule",
+    "LEAST_RATE": "splatting.training.schedule",
+    "SCORED_VIEWS": "splatting.parts.budget",
+    "SH_INTERVAL": "splatting.training.run",
+    "AN_ITERATION": "splatting.parts.time_budget_schedule",
+    "SHORT": "splatting.parts.time_budget_schedule",
+}
+
+
+class Job(NamedTuple):
+    """A training: the scene, a constant and its factor ("" and 1: none is changed), and the seed."""
+
+    scene: str
+    constant: str
+    factor: float
+    seed: int
+
+
+def value_of(constant: str) -> float:
+    """The value of a constant that no one has changed."""
+    from arguments.launch import training_parser
+
+    if constant in OPTIONS:
+        return vars(training_parser()[0].parse_args([]))[constant]
+    return getattr(*place(constant))
+
+
+def place(constant: str) -> tuple[Any, str]:
+    """The module or class that has a constant, and its name there."""
+    owner, _, name = constant.rpartition(".")
+    module = importlib.import_module(ATTRIBUTES[constant])
+    return getattr(module, owner) if owner else module, name
+
+
+def changed(constant: str, factor: float) -> float:
+    """The value of a constant, or its distance from 1, times a factor; a whole number stays one."""
+    value = value_of(constant)
+    new = 1 - (1 - value) * factor if constant in FROM_ONE else value * factor
+    return max(round(new), 1) if isinstance(value, int) else new
+
+
+def train_with(job: Job, words: Sequence[str], gpus: Any) -> float:
+    """Train in this process, and return the PSNR of the test views at the end (dB)."""
+    import train
+
+    gpu = gpus.get()
+    if gpu is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)
+    options: list[str] = []
+    if job.constant in OPTIONS:
+        options = [f"--{job.constant}", str(changed(job.constant, job.factor))]
+    elif job.constant:
+        setattr(*place(job.constant), changed(job.constant, job.factor))
+    try:
+        with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
+            base = ["-s", job.scene, "-m", out, "--eval", "--quiet", "--disable_viewer", "--no_last_checkpoint"]
+            train.main([*base, "--strategy", "budget", "--seed", str(job.seed), *words, *options])
+            return [row["test_psnr"] for row in read_curve(Path(out) / NAME) if row["test_psnr"] is not None][-1]
+    finally:
+        gpus.put(gpu)
+
+
+def table(jobs: Sequence[Job], found: dict[Job, float], seeds: Sequence[int], scenes: Sequence[str]) -> list[list[str]]:
+    """Rows of the table: a constant, its value, and for each scene what halving and doubling it changes."""
+
+    def gain(scene: str, constant: str, factor: float) -> str:
+        pairs = [found[Job(scene, constant, factor, seed)] - found[Job(scene, "", 1, seed)] for seed in seeds]
+        error = f" ± {statistics.stdev(pairs) / len(pairs) ** 0.5:.2f}" if len(pairs) > 1 else ""
+        return f"{statistics.mean(pairs):+.2f}{error}"
+
+    constants = dict.fromkeys(job.constant for job in jobs if job.constant)
+    first = [f"{statistics.mean(found[Job(scene, '', 1, seed)] for seed in seeds):.2f} dB" for scene in scenes]
+    rows = [["none changed", "", *(cell for one in first for cell in (one, ""))]]
+    for constant in constants:
+        cells = [gain(scene, constant, factor) for scene in scenes for factor in (0.5, 2)]
+        rows.append([f"`{constant}`", f"{value_of(constant):g}", *cells])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", nargs="+", help="scenes with test views")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="default: 0 1")
+    parser.add_argument("--gpus", type=int, nargs="+", help="one training at a time for each number; default: the CPU")
+    parser.add_argument("--constants", nargs="+", default=[*OPTIONS, *ATTRIBUTES], help="default: all")
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    args = parser.parse_args(words[:cut])
+    changes = [("", 1.0), *((name, factor) for name in args.constants for factor in (0.5, 2.0))]
+    jobs = [Job(scene, *change, seed) for change in changes for scene in args.scenes for seed in args.seeds]
+    context = multiprocessing.get_context("spawn")
+    with context.Manager() as manager:
+        gpus = manager.Queue()
+        for gpu in args.gpus or [None]:
+            gpus.put(gpu)
+        with context.Pool(len(args.gpus or [None]), maxtasksperchild=1) as pool:
+            run = partial(train_with, words=words[cut + 1 :], gpus=gpus)
+            found = dict(zip(jobs, tqdm(pool.imap(run, jobs), total=len(jobs), unit="training"), strict=True))
+            pool.close()
+            pool.join()
+    names = [Path(scene).name for scene in args.scenes]
+    print(describe("cuda" if args.gpus else "cpu"))
+    header = ["constant", "value", *(f"{name}: {what}" for name in names for what in ("halved", "doubled"))]
+    print_table(header, table(jobs, found, args.seeds, args.scenes))
+
+
+if __name__ == "__main__":
+    run_cli(main)
