@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from gaussian_renderer.blending import blending_weights, most_important
+from gaussian_renderer.importance import most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
 from scene.cameras import Camera
@@ -86,29 +86,24 @@ def thin_out(
     options: argparse.Namespace,
     scored: bool,
 ) -> np.ndarray:
-    """The mask `keep` without what matters least to the training views, with `count` Gaussians left; print the loss.
+    """Indices of the `count` Gaussians of the mask `keep` that the training views need most, the most needed first.
 
-    What matters is the sum of blending weights over all pixels of the training views. scored: photos show all of it.
+    Print the loss, if any go. scored: photos show all of it.
     """
     every, cameras = scene.gaussians, scene.getTrainCameras()
     kept = np.flatnonzero(keep)
-    if len(kept) <= count:
-        return keep
     before = every.part(torch.from_numpy(keep).to(every.get_xyz.device), sh_degree)
-    with torch.enable_grad():
-        weights = blending_weights(before, cameras, pipe)
-    chosen = most_important(weights, count)
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
     views = ScoredViews(pipe, background, scene.halves)
-    loss = "no score, as photos show more than the crop"
-    if scored:
-        change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)
-        one, other = change["psnr_before"], change["psnr_after"]
-        loss = f"training views {one:.2f} -> {other:.2f} dB ({other - one:+.2f} dB)"
-    print(f"{len(kept):,} -> {count:,} Gaussians: {loss}; train.py --max_num_splats {count} gives a better one")
-    thinned = np.zeros_like(keep)
-    thinned[kept[chosen.cpu().numpy()]] = True
-    return thinned
+    chosen = most_needed(before, cameras, views, count)
+    if len(chosen) < len(kept):
+        loss = "no score, as photos show more than the crop"
+        if scored:
+            change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)
+            one, other = change["psnr_before"], change["psnr_after"]
+            loss = f"training views {one:.2f} -> {other:.2f} dB ({other - one:+.2f} dB)"
+        print(f"{len(kept):,} -> {count:,} Gaussians: {loss}; train.py --max_num_splats {count} gives a better one")
+    return kept[chosen.cpu().numpy()]
 
 
 def sky_of(model: str | None, means: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ the backward of the rasterizer sums weights over pixels, and an image of other c
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 from gaussian_renderer import draw, render
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from splatting.host.progress import Bar
 
 
 class Plane(NamedTuple):
@@ -41,23 +40,6 @@ def weighted_sums(
     """
     drawn = draw(camera, gaussians, pipe, background)
     return drawn.color_gradient(value(drawn.image))
-
-
-def blending_weights(gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam], pipe: argparse.Namespace) -> Tensor:
-    """Sum of each Gaussian's blending weights over all pixels of all views: (N,) float64."""
-    black = gaussians.get_xyz.detach().new_zeros(3)
-    sums = torch.zeros(len(gaussians), dtype=torch.float64, device=black.device)
-    for camera in Bar(cameras, desc="Weighing Gaussians", unit="view", leave=False):
-        sums += weighted_sums(camera, gaussians, pipe, black, torch.ones_like)[:, 0]
-    return sums
-
-
-def most_important(weights: Tensor, count: int) -> Tensor:
-    """(N,) bool: the `count` Gaussians of the largest weights, and of equal ones the first."""
-    order = torch.argsort(weights, descending=True, stable=True)
-    keep = torch.zeros(len(weights), dtype=torch.bool, device=weights.device)
-    keep[order[:count]] = True
-    return keep
 
 
 @torch.no_grad()

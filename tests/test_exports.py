@@ -13,14 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from gaussians import model, pipeline
+from gaussians import model
 from plyfile import PlyData
 from scipy.spatial import KDTree, cKDTree
 from small_splats import COUNT, FAR, cube, empty_spz, extreme_splats, moved, splats, written
 
-from gaussian_renderer import render
-from gaussian_renderer.blending import blending_weights, most_important
-from gaussian_renderer.free_view import free_view, rotation_matrix
+from gaussian_renderer.free_view import rotation_matrix
 from scene.export_world import export_world
 from scene.splats.ply import CHUNK
 from scene.splats.reading import read_splats
@@ -321,18 +319,6 @@ def test_selection():
     some.rotations[5] = 0
     np.testing.assert_array_equal(tidy(some).rotations[5], [1, 0, 0, 0])
     np.testing.assert_allclose(1 / (1 + np.exp(-logits(np.float32([0, 0.5, 1]), 0.1))), [0.025, 0.5, 0.975], atol=1e-6)
-
-
-def test_weights_are_those_of_blending():
-    """Over a black background, with all colours 1, a pixel is the sum of its weights."""
-    gaussians, pipe = model(40), pipeline()
-    camera = free_view(41, 27, 0.6, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), "cpu")
-    weights = blending_weights(gaussians, [camera, camera], pipe)
-    image = render(camera, gaussians, pipe, torch.zeros(3), override_color=torch.ones(40, 3), clamp=False)["render"]
-    torch.testing.assert_close(weights.sum(), 2 * image[0].sum().double().detach(), rtol=1e-5, atol=0)
-    assert (weights >= 0).all() and (weights > 0).sum() > 10
-    kept = most_important(weights, 7)
-    assert kept.sum() == 7 and weights[kept].min() >= weights[~kept].max()
 
 
 def test_unknown_endings_and_files_are_refused(tmp_path):

@@ -17,7 +17,8 @@ from small_splats import splats, written
 import export
 import render
 import train
-from gaussian_renderer.blending import blending_weights, most_important
+from gaussian_renderer.importance import most_needed
+from gaussian_renderer.scored_views import ScoredViews
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import save_checkpoint
 from scene.gaussians.ply import read_ply
@@ -233,7 +234,8 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     opaque = scene.gaussians.get_opacity[:, 0] >= 0.3
     assert int(count) == opaque.sum() > 100
     part = scene.gaussians.part(opaque, 3)
-    best = part.part(most_important(blending_weights(part, scene.getTrainCameras(), args[2]), 100), 3)
+    views = ScoredViews(args[2], torch.zeros(3), False)
+    best = part.part(most_needed(part, scene.getTrainCameras(), views, 100), 3)
     np.testing.assert_allclose(read_splats(target).means, best.get_xyz.detach().numpy())
     assert after > 0 and abs(before - after) < 20
     for path, at in ((start, start), (None, out / "input.ply"), (None, find_save(str(out), -1)[1])):

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gaussian_renderer.blending import weighted_sums
 from gaussian_renderer.free_view import FRACTIONS, neighbours, views_between
+from gaussian_renderer.importance import change_without
 from gaussian_renderer.scored_views import ScoredViews
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -32,7 +33,6 @@ from utils.system_utils import UserError, compute_device
 
 OPTION = {"type": float, "nargs": "?", "const": 0.05, "metavar": "DB"}  # --clean, as argparse takes it
 _STEPS = 1000  # a search ends within N / _STEPS of the most that may go
-_SOLID = 1e-3  # least transparency in the derivative by an opacity
 _EXACT = 1e-12  # least squared error of a view
 _SHOWN = 3  # views of the picture
 
@@ -86,16 +86,13 @@ class Cleaning:
     def changes(self) -> Tensor:
         """(N,) float64: the change of the views' errors without a Gaussian, as a sum of shares of these errors."""
         gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
-        logits = gaussians.raw("opacity")
-        transparency = (1 - gaussians.get_opacity.detach()[:, 0]).clamp_min(_SOLID)
         for camera in Bar(self._cameras, desc="Asking the photos", unit="view", leave=False):
             with torch.enable_grad():
                 image, target, mask = self._views.compared(camera, gaussians)
                 if mask is not None and not mask.any():
                     continue
                 error = pixels_that_count(image - as_float(target), mask).square().mean()
-                (slope,) = torch.autograd.grad(error, logits)
-            found[self.keep] -= (slope[:, 0] / transparency).double() / error.detach().double().clamp_min(_EXACT)
+                found[self.keep] += change_without(error, gaussians) / error.detach().double().clamp_min(_EXACT)
         return found.nan_to_num(0.0)
 
     def added(self) -> Tensor:
