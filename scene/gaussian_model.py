@@ -5,7 +5,6 @@ import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -24,9 +23,6 @@ from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    from splatting.part import Strategy
 
 _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
@@ -135,16 +131,12 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         )
         self.exposures.training_setup(training_args)
 
-    def follow(self, strategy: "Strategy") -> None:
-        """Step as a strategy asks for, with the averages that there are. An optimiser of other code stays."""
-        self._rates["f_rest"] *= strategy.band_rate
+    def step_sparsely(self) -> None:
+        """Step only what a view sees from now on, with the averages that there are. Other code's optimiser stays."""
         old = self.optimizer
-        if type(old) in _OPTIMIZERS.values():
-            kind = SparseGaussianAdam if strategy.seen_only else type(old)
-            groups = (
-                {"params": g["params"], "lr": self._rates[g["name"]], "name": g["name"]} for g in old.param_groups
-            )
-            self.optimizer = kind([*groups])
+        if type(old) is GaussianAdam:
+            groups = ({key: group[key] for key in ("params", "lr", "name")} for group in old.param_groups)
+            self.optimizer = SparseGaussianAdam([*groups])
             self.optimizer.state.update(old.state)
             self.limit_columns()
 
@@ -158,11 +150,14 @@ class GaussianModel(ReferenceNames, GaussianParameters):
                 break
         return rate
 
-    def scale_rates(self, factor: float) -> None:
-        """Set the learning rates that `training_setup` has made to a multiple, but that of the positions."""
+    def scale_rates(self, factor: float, bands: float = 1.0) -> None:
+        """Set the learning rates that `training_setup` has made to a multiple, but that of the positions.
+
+        bands: further factor of that of SH bands above degree 0.
+        """
         for group in self.optimizer.param_groups:
             if group.get("name") in self._rates and group["name"] != "xyz":
-                group["lr"] = factor * self._rates[group["name"]]
+                group["lr"] = (factor * bands if group["name"] == "f_rest" else factor) * self._rates[group["name"]]
 
     @property
     def position_learning_rate(self) -> float:

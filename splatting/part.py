@@ -248,7 +248,7 @@ class Strategy(Part):
     queues: whether `after_step` queues operators that change the model; it queues nothing else, unless the iteration is
         one that `changes` names.
     seen_only: whether a step concerns only what the view sees, as with --optimizer_type sparse_adam.
-    band_rate: factor of the learning rate of SH bands above degree 0.
+    band_rate: factor of the learning rate of SH bands above degree 0, as far as few iterations allow it.
 
     Of a run, set in `begin`:
     max_gaussians: how many it lets there be, 0: any number.

@@ -41,7 +41,6 @@ ATTRIBUTES = {
     "SCORED_VIEWS": "splatting.parts.budget",
     "SH_INTERVAL": "splatting.training.run",
     "AN_ITERATION": "splatting.parts.time_budget_schedule",
-    "SHORT": "splatting.parts.time_budget_schedule",
 }
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatting.option import Option, within
 from splatting.part import Options, Strategy
-from splatting.training.schedule import USUAL, longer_steps
+from splatting.training.schedule import longer_steps
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -68,13 +68,11 @@ class Budget(Strategy):
 
     def rate_factor(self, iteration: int) -> float:
         """Learning rates follow the number of iterations, and fall at the end."""
-        length = self.schedule.length
-        return longer_steps(USUAL / length, iteration / length)
+        return longer_steps(self.schedule.usual_stride(iteration), iteration / self.schedule.length)
 
     def beta2(self, iteration: int) -> float:
         """Fewer iterations average over fewer of them, by the root of their number as their steps are longer."""
-        stride = self.schedule.stride(iteration) * USUAL / self.schedule.length
-        return 1.0 - min(SQUARES * math.sqrt(stride), 1 / LEAST_AVERAGED)
+        return 1.0 - min(SQUARES * math.sqrt(self.schedule.usual_stride(iteration)), 1 / LEAST_AVERAGED)
 
     def changes(self, iteration: int) -> bool:
         in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter

@@ -74,7 +74,10 @@ class TimeBudget(Part):
                 setattr(opt, name, int(part * opt.iterations))
 
     def begin(self, run: Any, state: Any) -> None:
+        from splatting.parts.time_budget_schedule import SHORT
+
         run.schedule.random = _is_random(run.scene)
+        run.schedule.short = SHORT[run.device.type]
         run.schedule.megapixels = run.scene.training_pixels()[0] / len(run.scene.getTrainCameras()) / 1e6
         fill(run, "sizes", Sizes(run.schedule, run.scene.images), self)
 

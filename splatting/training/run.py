@@ -42,7 +42,7 @@ from splatting.training.agreement import agree_on_scene
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.save import Checkpoints
-from splatting.training.schedule import Schedule
+from splatting.training.schedule import Schedule, within_most
 from splatting.training.trim_report import TrimReport, trimmed
 from splatting.training.watch import DivergenceWatch
 from utils.system_utils import UserError, compute_device
@@ -190,8 +190,8 @@ class Run:
         check_together(self.parts, self._all_options, self.group.several)
         strategy.check(self, states.get(strategy.name))
         strategy.begin(self, states.get(strategy.name))
-        if strategy.seen_only or strategy.band_rate != 1:
-            self.gaussians.follow(strategy)
+        if strategy.seen_only:
+            self.gaussians.step_sparsely()
         return strategy
 
     def _check_records(self) -> None:
@@ -342,15 +342,17 @@ class Run:
         """Set the learning rates of a step, which may be one that is repeated."""
         self.gaussians.exposures.held = self.strategy.recovers(at.iteration)
         self.gaussians.update_learning_rate(self.schedule.schedule_step(at.iteration))
-        factor = self.schedule.rate_factor(at.iteration)
+        factor, bands = self.schedule.rate_factor(at.iteration), self.strategy.band_rate
         if factor is None:
             factor = self.strategy.rate_factor(at.iteration)
         if factor is not None:
             sparse = isinstance(self.gaussians.optimizer, SparseGaussianAdam)
-            self.gaussians.scale_rates(factor * (bias_correction(at.iteration) if sparse else 1.0))
-        if (beta2 := self.strategy.beta2(at.iteration)) is not None and isinstance(
-            self.gaussians.optimizer, GaussianAdam
-        ):
+            factor *= bias_correction(at.iteration) if sparse else 1.0
+            bands = within_most(bands, self.schedule.usual_stride(at.iteration))
+        if factor is not None or bands != 1:
+            self.gaussians.scale_rates(1.0 if factor is None else factor, bands)
+        beta2 = self.strategy.beta2(at.iteration)
+        if beta2 is not None and isinstance(self.gaussians.optimizer, GaussianAdam):
             self.gaussians.optimizer.set_beta2(beta2)
 
     def decode_ahead(self, iteration: int) -> None:

@@ -72,6 +72,10 @@ class Schedule:
         """Iterations of the schedule that one of the run stands for, at that place."""
         return 1.0
 
+    def usual_stride(self, iteration: int) -> float:
+        """Iterations of the USUAL ones that one of the run stands for, at that place."""
+        return self.stride(iteration) * USUAL / self.length
+
     def rate_factor(self, iteration: int) -> float | None:
         """Factor of the learning rates that have no schedule. None: they are left as they are."""
         return None
@@ -117,6 +121,15 @@ def longer_steps(stride: float, progress: float) -> float:
     end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
     schedule that is done, 0 to 1.
     """
-    longer = max(min(LONGER * math.sqrt(stride), MOST_RATE), 1.0)
+    longer = _longer(stride)
     late = min(max(progress - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)
     return longer * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
+
+
+def within_most(factor: float, stride: float) -> float:
+    """A further factor of a learning rate, as far as it is at most MOST_RATE with that of `longer_steps`."""
+    return min(factor, max(MOST_RATE / _longer(stride), 1.0))
+
+
+def _longer(stride: float) -> float:
+    return max(min(LONGER * math.sqrt(stride), MOST_RATE), 1.0)

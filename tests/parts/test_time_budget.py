@@ -354,10 +354,10 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
         return _train(colmap_scene, tmp_path / name, "-r", 1, "--iterations", 1200, *more)
 
     _timed(monkeypatch, lambda t: 0.04)
-    monkeypatch.setattr(f"{TimeBudget.__module__}.SHORT", 0.01)  # for photos this small
+    monkeypatch.setattr(f"{TimeBudget.__module__}.SHORT", {"cpu": 0.01, "cuda": 0.01})  # for photos this small
     short = trained("short", "--time_budget", 4, "--checkpoint_iterations", 600)
     with monkeypatch.context() as patch:
-        patch.setattr(f"{TimeBudget.__module__}.SHORT", math.inf)
+        patch.setattr(f"{TimeBudget.__module__}.SHORT", {"cpu": math.inf, "cuda": math.inf})
         whole = trained("whole", "--time_budget", 4)
     assert short.keys() == whole.keys() and short != whole  # by a clock that sizes do not move
     monkeypatch.undo()
