@@ -248,10 +248,10 @@ class Strategy(Part):
     queues: whether `after_step` queues operators that change the model; it queues nothing else, unless the iteration is
         one that `changes` names.
     seen_only: whether a step concerns only what the view sees, as with --optimizer_type sparse_adam.
-    band_rate: factor of the learning rate of SH bands above degree 0, as far as few iterations allow it.
 
     Of a run, set in `begin`:
     max_gaussians: how many it lets there be, 0: any number.
+    band_rate: factor of the learning rate of SH bands above degree 0.
     ends: the iteration of the schedule from which it changes no rows.
     penalty: a part of the loss besides the objective, of which steps add the gradients (scene/gaussians/penalty.py). No
         loss that is told has it.
@@ -269,8 +269,8 @@ class Strategy(Part):
     fusable: ClassVar[bool] = False
     queues: ClassVar[bool] = False
     seen_only: ClassVar[bool] = False
-    band_rate: ClassVar[float] = 1.0
     max_gaussians = 0
+    band_rate = 1.0
     ends = math.inf
     penalty: Any = ()
     absolute_gradients = False

@@ -42,7 +42,7 @@ from splatting.training.agreement import agree_on_scene
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.save import Checkpoints
-from splatting.training.schedule import Schedule, within_most
+from splatting.training.schedule import Schedule
 from splatting.training.trim_report import TrimReport, trimmed
 from splatting.training.watch import DivergenceWatch
 from utils.system_utils import UserError, compute_device
@@ -348,7 +348,6 @@ class Run:
         if factor is not None:
             sparse = isinstance(self.gaussians.optimizer, SparseGaussianAdam)
             factor *= bias_correction(at.iteration) if sparse else 1.0
-            bands = within_most(bands, self.schedule.usual_stride(at.iteration))
         if factor is not None or bands != 1:
             self.gaussians.scale_rates(1.0 if factor is None else factor, bands)
         beta2 = self.strategy.beta2(at.iteration)

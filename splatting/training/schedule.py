@@ -121,15 +121,6 @@ def longer_steps(stride: float, progress: float) -> float:
     end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
     schedule that is done, 0 to 1.
     """
-    longer = _longer(stride)
+    longer = max(min(LONGER * math.sqrt(stride), MOST_RATE), 1.0)
     late = min(max(progress - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)
     return longer * (1.0 - (1.0 - LEAST_RATE) * late * late * (3.0 - 2.0 * late))
-
-
-def within_most(factor: float, stride: float) -> float:
-    """A further factor of a learning rate, as far as it is at most MOST_RATE with that of `longer_steps`."""
-    return min(factor, max(MOST_RATE / _longer(stride), 1.0))
-
-
-def _longer(stride: float) -> float:
-    return max(min(LONGER * math.sqrt(stride), MOST_RATE), 1.0)
