@@ -350,9 +350,9 @@ class Run:
             factor *= bias_correction(at.iteration) if sparse else 1.0
         if factor is not None or bands != 1:
             self.gaussians.scale_rates(1.0 if factor is None else factor, bands)
-        beta2 = self.strategy.beta2(at.iteration)
-        if beta2 is not None and isinstance(self.gaussians.optimizer, GaussianAdam):
-            self.gaussians.optimizer.set_beta2(beta2)
+        beta2, optimizer = self.strategy.beta2(at.iteration), self.gaussians.optimizer
+        if beta2 is not None and isinstance(optimizer, GaussianAdam):
+            optimizer.set_beta2(beta2)
 
     def decode_ahead(self, iteration: int) -> None:
         """Begin to decode the photos of an iteration and of those that follow it."""

@@ -310,3 +310,10 @@ def test_a_number_out_of_reach_is_told(strategy, number, changes, first, said):
     control = _control(Schedule(160), strategy=strategy, max_num_splats=number, **changes)
     told = another_number(control, control._opt, 300, first)
     assert told is None if said is None else said in str(told)
+
+
+@pytest.mark.parametrize(("iterations", "beta2"), [(30_000, 0.995), (7_500, 0.99), (300, 0.95), (10, 1 - 1 / 16)])
+def test_fewer_iterations_average_squared_gradients_over_fewer(iterations, beta2):
+    block = Block(iterations, 0.0, 1 / iterations, 0.0)
+    for schedule in (Schedule(iterations), DecidedSchedule(Decided(30_000, [block], iterations, 0.0))):
+        assert begun("budget", schedule=schedule).beta2(iterations) == pytest.approx(beta2)

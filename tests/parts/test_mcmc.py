@@ -9,7 +9,7 @@ import torch
 from gaussians import GROUPS, model, options, take_steps
 from strategies import begun
 from torch import Tensor
-from trainings import MCMC, train_on
+from trainings import MCMC, narrow_scene, train_on
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
@@ -74,6 +74,15 @@ def test_the_start_is_more_opaque_and_smaller_than_the_points(colmap_scene, tmp_
     torch.testing.assert_close(mcmc.get_scaling, 0.1 * adc.get_scaling)
     given = start("given", "--init_ply", tmp_path / "adc" / ply)
     torch.testing.assert_close(given.get_scaling, adc.get_scaling)  # a model brings its own shapes
+
+
+def test_a_step_leaves_what_the_view_does_not_see(tmp_path):
+    scene = narrow_scene(tmp_path / "scene")
+    words = "--strategy", "mcmc", "--quiet", "--disable_viewer", "--no_curve", "--mcmc_noise", 0
+    train_on(scene, tmp_path / "out", *words, "--iterations", 4, "--checkpoint_iterations", 2, 3)
+    opacities = [load_checkpoint(tmp_path / "out" / f"chkpnt{t}.pth")[0][6] for t in (2, 3)]
+    stayed = (opacities[0] == opacities[1]).float().mean()
+    assert 0.5 < stayed < 0.99
 
 
 def test_a_scene_that_fades_is_refused(colmap_scene, tmp_path):
