@@ -154,7 +154,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         keep &= ~sky_of(args.model_path, splats.means)
     if args.clean:
         keep &= cleaned(scene, args.clean, pipe, options, args.to)
-    if args.max_splats:
+    if args.max_splats and (entry.in_order or keep.sum() > args.max_splats):
         keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
     chosen = tidy(with_sh_degree(selected(splats, keep), degree))
     if getattr(pipe, "projection", "ewa") == "ray":

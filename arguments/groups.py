@@ -173,7 +173,7 @@ class OptimizationParams(OptionTable):
         Option("optimizer_type", "default", check=one_of("default", "sparse_adam"), stored=MODEL_JSON,
             topic="quality and speed",
             help="default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians "
-                 "that the view sees, which is faster if views see little of the scene"),
+                 "that the view sees, which is faster if views see little of the scene; mcmc always takes it"),
         Option("max_num_splats", 0, origin="ours", check=at_least(0), topic=MOST_NEEDED,
             help="largest number of Gaussians; 0: no limit with adc, 1,000,000 with mcmc, and with budget as "
                  "--strategy says. If a training starts with more, only budget removes the surplus"),

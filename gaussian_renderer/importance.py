@@ -50,15 +50,14 @@ def most_needed(gaussians: GaussianModel, cameras: Sequence[Camera], views: Scor
     The first ones of them, however many, are a model, too.
     """
     count = min(count, len(gaussians))
-    images = [views.image(camera, gaussians).half().cpu() for camera in cameras]
     signs = torch.Generator(gaussians.get_xyz.device).manual_seed(0)
     left, gone, squares = torch.arange(len(gaussians), device=gaussians.get_xyz.device), [], None
     with Bar(desc="Ordering Gaussians", unit="round", leave=False) as bar:
         while len(left):
             part = gaussians.part(left, gaussians.max_sh_degree)
             errors, now = torch.zeros(2, len(left), dtype=torch.float64, device=left.device)
-            for camera, image in zip(cameras, images, strict=True):
-                first, second = _terms(camera, part, views, image.to(left.device), signs)
+            for camera in cameras:  # the whole model's images of many photos would not fit into the memory
+                first, second = _terms(camera, part, views, views.image(camera, gaussians), signs)
                 errors, now = errors + first, now + second
             squares = now if squares is None else _MEMORY * squares + (1 - _MEMORY) * now
             order = torch.argsort((_TRUST * errors + squares).nan_to_num(0.0), descending=True, stable=True)

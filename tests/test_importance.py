@@ -89,3 +89,12 @@ def test_an_exported_ply_is_sorted(scene, tmp_path, monkeypatch):
     assert len(every) == len(scene.gaussians) and len(few) == 1000
     first = {tuple(mean) for mean in every.means[:1000].tolist()}
     assert len(first & {tuple(mean) for mean in few.means.tolist()}) > 900
+
+
+def test_what_nobody_orders_is_not_asked_for(scene, tmp_path, monkeypatch):
+    """A format with an order of its own, and room for all Gaussians."""
+    words = ["export.py", "-m", scene.model_path, "--max_splats", str(10**6), "--to", str(tmp_path / "a.splat")]
+    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr(export, "most_needed", None)
+    export.main()
+    assert len(read_splats(tmp_path / "a.splat")) == len(scene.gaussians)

@@ -49,8 +49,8 @@ class Format:
     write: writes a file of splats, whole or not at all, and returns what it is, where it is not splats. UserError if it
     cannot be written. of_scene: it also takes `Around`. options: of export.py that are for this kind of files only.
     around: views from around a model do, where there is no scene. clean: it is cleaned unless --raw is given. bands: it
-    keeps SH bands. check: raises UserError if a package or program that the file needs is missing, or if a
-    file of the user is in the way of one that is written beside it.
+    keeps SH bands. in_order: it keeps the order of rows. check: raises UserError if a package or program that the file
+    needs is missing, or if a file of the user is in the way of one that is written beside it.
     """
 
     ending: str
@@ -61,6 +61,7 @@ class Format:
     bands: bool = True
     around: bool = False
     clean: bool = False
+    in_order: bool = False
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
@@ -125,11 +126,11 @@ FORMATS = (
         "mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, ("voxel",), bands=False, check=find_skimage
     ),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
-    Format(".ply", write_plain_ply, "float32, everything kept"),
+    Format(".ply", write_plain_ply, "float32, everything kept", in_order=True),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
     Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_splat_transform),
-    Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32"),
+    Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32", in_order=True),
     Format(
         "cesium.json", partial(_write_tileset, compressed=True), "3D Tiles for CesiumJS, as SPZ 2", True, around=True
     ),
@@ -142,7 +143,7 @@ FORMATS = (
         around=True,
         check=find_splat_transform,
     ),
-    Format(".usdz", write_usdz, "OpenUSD, float32", check=find_pxr),
+    Format(".usdz", write_usdz, "OpenUSD, float32", in_order=True, check=find_pxr),
     Format(
         ".html",
         _write_html,
