@@ -51,6 +51,8 @@ if TYPE_CHECKING:  # SciPy takes a while to import
     from splatting.camera_paths.keyframes import TimedPath
     from splatting.camera_paths.poses import Poses
 
+FOR_PHONES = 500_000  # Gaussians of a page
+
 
 def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: bool) -> tuple[Splats, Scene | None]:
     """The splats that the command line names, and the scene if views are wanted.
@@ -140,11 +142,11 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         args.clean = CLEAN_OPTION["const"]
     if args.clean:
         refuse_foreign(_picture_of_removed(args.to))
-    needs_photos = bool(args.max_splats or args.clean)
-    poses = stand_ins(args, options) if entry.around and not needs_photos else None
+    needs_scene = bool(args.max_splats or args.clean or args.walk)
+    poses = stand_ins(args, options) if entry.around and not needs_scene else None
     if poses and entry.clean and args.model_path and not args.raw:
         print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
-    needs_views = needs_photos or entry.of_scene and not poses or oriented_later(args)
+    needs_views = needs_scene or entry.of_scene and not poses or oriented_later(args)
     splats, scene = load(args, options, needs_views)
     if scene:
         _check_views(args, make_path, scene.getTrainCameras())
@@ -162,7 +164,9 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
     cameras = poses(chosen) if poses else scene and scene.getTrainCameras()
-    around = entry.of_scene and Around(cameras, background, pipe, make_path, args.voxel, args.start, args.title)
+    around = entry.of_scene and Around(
+        cameras, background, pipe, make_path, args.voxel, args.start, args.title, args.notes, args.walk
+    )
     chosen, around = placed(args, entry.of_scene, chosen, around)
     what = entry.write(args.to, chosen, *((around,) if around else ()))
     size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
@@ -175,6 +179,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     else:
         each = ""
     print(f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB{each}, {seconds:.1f} s")
+    if entry.clean and len(chosen) > FOR_PHONES:
+        print(f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; --max_splats {FOR_PHONES} makes a page for them")
 
 
 def stand_ins(args: argparse.Namespace, options: argparse.Namespace) -> Callable[[Splats], list[Camera]] | None:
@@ -197,7 +203,7 @@ def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
 
 def _check_fitting(args: argparse.Namespace, entry: Format) -> None:
     """UserError for an option that is for files of another kind."""
-    for option in ("path", "voxel", "start", "title", "raw"):
+    for option in ("path", "voxel", "start", "title", "notes", "walk", "raw"):
         if getattr(args, option) and option not in entry.options:
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
@@ -211,12 +217,12 @@ def _check_views(
     A warning if the views are not those of the training.
     """
     from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
-    from splatting.exports.page_start import named_start
+    from splatting.exports.page_start import named
 
     if not args.ply:
         warn_if_moved(args.model_path, cameras)
     if args.start is not None:
-        named_start(args.start, [str(camera.image_name) for camera in cameras])
+        named(args.start, [str(camera.image_name) for camera in cameras], f"--start {args.start}")
     if make_path and cameras:
         make_path(poses_of(cameras))
 
@@ -262,6 +268,9 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--start", metavar="PHOTO", help="training photo that an .html begins at (default: one that looks straight at "
         "the middle)")  # fmt: skip
     add("--title", metavar="TEXT", help="title of an .html (default: the name of the file)")
+    add("--notes", metavar="FILE", help="Markdown with title, author, date and licence of an .html, and notes on views "
+        "(docs/guide/web_pages.md; default: none)")  # fmt: skip
+    add("--walk", action="store_true", help="let guests of an .html walk on the floor and stop at walls (default: off)")
     add("--raw", action="store_true", help="do not --clean an .html (default: cleaned, if its scene is there)")
     add("--voxel", type=float, metavar="UNITS",
         help="size of a mesh's voxels in the scene's unit (default: two pixels at the median depth)")  # fmt: skip

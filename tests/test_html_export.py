@@ -19,6 +19,7 @@ from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
 from splatting.camera_paths.poses import poses_of
 from splatting.exports import html, vendor
 from splatting.exports.html import settings, turn_upright, up_of, write_html
+from splatting.exports.notes import Note, Notes
 from utils.system_utils import UserError
 
 # Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a
@@ -104,12 +105,14 @@ def test_names_stay_names(tmp_path, name):
     views = cameras()
     for camera in views:
         camera.image_name = name
-    write_html(tmp_path / "page.html", balls(each=2), views, title=name)
+    notes = Notes(facts=(("author", name),), text=name, views=(Note(name, name, name),))
+    write_html(tmp_path / "page.html", balls(each=2), views, title=name, notes=notes)
     page = Page(tmp_path / "page.html")
     assert [tag for tag, _ in page.tags].count("script") == 4
     shown = name.encode("utf-8", "backslashreplace").decode()
     content = json.loads(page.texts["page"])
-    assert page.texts["title"] == shown and content["settings"]["annotations"][0]["title"] == name
+    mark = content["settings"]["annotations"][0]
+    assert page.texts["title"] == page.texts["summary"] == shown and mark["title"] == mark["text"] == name
 
 
 def test_a_page_has_the_name_of_its_file_its_background_and_the_viewers_licence(page):
@@ -147,7 +150,7 @@ def test_the_first_camera_is_where_the_page_begins(page):
     assert first["position"] == pytest.approx(axes @ pose.positions[0], abs=1e-6)
     assert first["target"] == pytest.approx(axes @ CENTRE, abs=1e-4) and first["fov"] == pytest.approx(FOV, abs=1e-4)
     marks = content["annotations"]
-    assert [mark["title"] for mark in marks] == [f"photo_{n}.jpg" for n in range(8)]
+    assert [mark["title"] for mark in marks] == [f"View {n} of 8" for n in range(1, 9)]
     assert marks[0]["camera"]["initial"] == first
     leans = [mark["extras"]["lean"] for mark in marks]
     assert leans[0] == pytest.approx(-12, abs=4) and np.abs(leans[1:]).max() < 3  # that camera also moves `up_of`

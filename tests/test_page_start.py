@@ -20,7 +20,7 @@ from splatting.camera_paths import without_scene
 from splatting.camera_paths.poses import Poses, poses_of
 from splatting.exports import cleaning
 from splatting.exports.formats import Around, format_of
-from splatting.exports.page_start import LEAST, PICTURE, best_start, named_start, narrowed, write_preview
+from splatting.exports.page_start import LEAST, PICTURE, best_start, named, narrowed, write_preview
 from utils.system_utils import UserError
 
 
@@ -45,15 +45,15 @@ def test_a_page_begins_at_a_usual_camera_that_looks_at_the_middle():
 
 def test_a_start_is_named_with_or_without_its_ending():
     names = [f"photo_{n}.jpg" for n in range(8)]
-    assert named_start("photo_3.jpg", names) == named_start("photo_3", names) == 3
+    assert named("photo_3.jpg", names, "") == named("photo_3", names, "") == 3
     with pytest.raises(UserError, match=r"--start photo is no training photo; there are photo_0.jpg, .* and 3 more"):
-        named_start("photo", names)
+        named("photo", names, "--start photo")
 
 
 def test_a_photo_fills_the_width_of_a_window_unless_that_is_very_wide():
     fov = math.radians(40)
     assert narrowed(fov, 1.5, 1.5) == narrowed(fov, 1.5, 0.5) == pytest.approx(fov)
-    assert math.tan(narrowed(fov, 1.2, 1.6) / 2) * 1.6 == pytest.approx(math.tan(fov / 2) * 1.2)
+    assert math.tan(narrowed(fov, 1.44, 1.6) / 2) * 1.6 == pytest.approx(math.tan(fov / 2) * 1.44)
     assert math.tan(narrowed(fov, 0.5, 2.0) / 2) == pytest.approx(LEAST * math.tan(fov / 2))
 
 

@@ -39,7 +39,10 @@ class Around(NamedTuple):
     voxel: float | None = None  # of a mesh, in the world's unit
     start: str | None = None  # of a page: the photo that it begins at
     title: str | None = None  # of a page
+    notes: str | None = None  # of a page: a file
+    walk: bool = False  # of a page: guests can walk
     upright: bool = False  # whether -y of all of these is up, so that a page need not find it
+    metric: bool = False  # whether the unit is known to be a metre
 
 
 @dataclass(frozen=True)
@@ -71,16 +74,24 @@ def _picture_of(page: str | os.PathLike) -> Path:
 
 def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None:
     from splatting.exports.html import write_html  # SciPy and jinja2 take a while to import
-    from splatting.exports.page_start import best_start, named_start, write_preview
+    from splatting.exports.notes import read_notes
+    from splatting.exports.page_start import best_start, named, write_preview
 
+    solid = None
+    if around.walk:
+        from splatting.exports.walking import solid_of, walkable
+
+        splats, around = walkable(splats, around)
+        solid = solid_of(splats, around.cameras, around.pipe)
     names = [str(camera.image_name) for camera in around.cameras]
     if around.start is not None:
-        start = named_start(around.start, names)
+        start = named(around.start, names, f"--start {around.start}")
     else:
         start = best_start(poses_of(around.cameras)) if names else 0
     picture = _picture_of(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
-    write_html(path, splats, around.cameras, *how, around.upright)
+    notes = read_notes(around.notes) if around.notes else None
+    write_html(path, splats, around.cameras, *how, around.upright, around.metric, notes, solid)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
@@ -149,7 +160,7 @@ FORMATS = (
         _write_html,
         "a page with a viewer",
         True,
-        ("path", "start", "title", "raw"),
+        ("path", "start", "title", "notes", "walk", "raw"),
         around=True,
         clean=True,
         check=lambda path: refuse_foreign(_picture_of(path)),

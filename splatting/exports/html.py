@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jinja2
 import numpy as np
@@ -22,19 +22,29 @@ from scene.splats.ply import packed_ply
 from scene.splats.splats import Splats, rotated
 from splatting.camera_paths.keyframes import TimedPath
 from splatting.camera_paths.poses import Poses, focus_point, poses_of
+from splatting.exports.notes import Note, Notes
+from splatting.exports.page_start import named
 from splatting.exports.vendor import FOLDER, RECORD, VIEWER
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError, atomic_write
+
+if TYPE_CHECKING:
+    from splatting.exports.walking import Solid
 
 LONGEST = 500_000_000  # letters of a page's text; Chromium's strings end at 2^29
 _NAME = "scene.compressed.ply"  # its ending tells the viewer the format
 UP = np.array([0.0, -1.0, 0.0])  # of the turned model, as in a usual capture
 _MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
-BOOKMARKS = 25  # the viewer's own limit of annotations
-_TITLE = 60  # and of letters in their titles
+BOOKMARKS = 10  # where no notes say which; the viewer takes 25 at most
+MOST_BOOKMARKS = 25
+_TITLE = 60  # letters of their titles, as the viewer has it
+_ASIDE, _UNDER = 0.5, 0.25  # of the usual depth, by which guests may leave the cameras' box, sideways and down
+_USUAL_DEPTH = 2.0  # metres from a camera to what it looks at, where nothing tells the scale
+SOLID = "model:/solid.voxel.json"  # where the viewer asks for what is solid; page.js answers
 _KEYS_A_SECOND = 10
 _MOST_KEYS = 1000
 _VIEWER_AXES = np.diag([-1.0, -1.0, 1.0])  # the viewer turns each model by half a turn about z
+_TEXTS = {"css": "viewer.css", "licence": "LICENSE"}
 _OFF = {"enabled": False}
 _NO_EFFECTS = {  # the viewer's post effects
     "sharpness": {**_OFF, "amount": 0},
@@ -55,14 +65,20 @@ def write_html(
     start: int = 0,
     picture: str = "",
     upright: bool = False,
+    metric: bool = False,
+    notes: Notes | None = None,
+    solid: "Solid | None" = None,
 ) -> None:
     """Write the page, whole or not at all.
 
-    cameras: the training views; up to 25 of them become bookmarks. make_path: makes the animation from their poses, as
-    of splatting/camera_paths/render_path.py. None: the viewer's own, which goes around the model, or sways where the
-    page's first camera is in the model's box. background: RGB in [0,1]. title: None: the file's name. start: which
-    camera the page begins at. picture: address of an image that is shown beside a link to the page; empty: none.
-    upright: whether up is UP already; if not, it is found by the cameras. UserError without a camera.
+    cameras: the training views; those that the notes name become bookmarks, or up to 10 of them. make_path: makes the
+    animation from their poses, as of splatting/camera_paths/render_path.py. None: the viewer's own, which goes around
+    the model, or sways where the page's first camera is in the model's box. background: RGB in [0,1]. title: None: that
+    of the notes, or the file's name. start: which camera the page begins at. picture: address of an image that is shown
+    beside a link to the page; empty: none. upright: whether up is UP already; if not, it is found by the cameras.
+    metric: whether a unit is a metre; if not, a headset shows the model as if photos were taken from two metres. solid:
+    what guests stop at when they walk, in the viewer's axes; None: they cannot walk. UserError without a camera, or
+    where notes name one that is not there.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
@@ -73,29 +89,38 @@ def write_html(
     # The median distance of the Gaussians from the page's first camera.
     distance = float(np.median(np.linalg.norm(splats.means - poses.positions[start], axis=1))) if len(splats) else 1.0
     aspects = [camera.image_width / camera.image_height for camera in cameras]
+    notes, depth = notes or Notes(), float(np.median(_depths(poses, focus_point(poses), distance)))
     page = {
         "antialiasing": splats.antialiasing,
         "aspect": aspects[start],
         "name": _NAME,
-        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects),
+        "limits": limits(poses, _VIEWER_AXES @ turn, depth),
+        "metre": 1.0 if metric else depth / _USUAL_DEPTH,
+        "solid": solid and {"address": SOLID, "about": solid.about},
+        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects, notes.views),
     }
-    options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
-    content = environment.get_template("page.html.jinja").render(
+    content = _template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
-        css=(FOLDER / "viewer.css").read_text(encoding="utf-8"),
-        licence=(FOLDER / "LICENSE").read_text(encoding="utf-8"),
         model=_packed_model(rotated(splats, turn)),
+        notes=notes,
         # No text in the JSON may end the script element that it stands in.
         picture=picture,
         page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),
-        record=read_json(RECORD),
-        title=Path(path).stem if title is None else title,
-        viewer=_in_base64((FOLDER / VIEWER).read_bytes()),
+        solid=_in_base64(gzip.compress(solid.content, mtime=0)) if solid else "",
+        title=(notes.title or Path(path).stem) if title is None else title,
     )
     with atomic_write(path) as temporary:
         # Names that are not UTF-8 have surrogates, which appear as numbers.
         temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
+
+
+def _template() -> jinja2.Template:
+    """The page's, with the viewer."""
+    options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
+    texts = {name: (FOLDER / file).read_text(encoding="utf-8") for name, file in _TEXTS.items()}
+    viewer = _in_base64((FOLDER / VIEWER).read_bytes())
+    return environment.get_template("page.html.jinja", globals={**texts, "record": read_json(RECORD), "viewer": viewer})
 
 
 def _in_base64(content: bytes) -> str:
@@ -144,19 +169,25 @@ def settings(
     distance: float = 1.0,
     start: int = 0,
     aspects: Sequence[float] | None = None,
+    notes: Sequence[Note] = (),
 ) -> dict[str, Any]:
     """The settings of a model that was turned by `turn` (3,3).
 
     poses, names: of the training cameras before that. path: the animation, in the same frame. background: RGB in [0,1].
     distance: of the model, about which cameras that are all in one place turn. start: which camera the viewer begins
-    at. aspects: width over height of the photos; None: all are square. Opening angles are vertical, in degrees.
+    at. aspects: width over height of the photos; None: all are square. notes: the bookmarks; none: BOOKMARKS cameras.
+    Opening angles are vertical, in degrees.
     """
     aspects = aspects or [1.0] * len(poses)
     axes = _VIEWER_AXES @ turn
     focus = focus_point(poses)
     depths = _depths(poses, focus, distance)
     cameras = [_look(axes, *camera) for camera in zip(poses.positions, poses.turns, depths, poses.fov, strict=True)]
-    marked = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
+    if notes:
+        marked = [(named(note.camera, names, f"--notes: {note.camera}"), note.name, note.text) for note in notes]
+    else:
+        chosen = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
+        marked = [(n, f"View {place} of {len(chosen)}", "") for place, n in enumerate(chosen, 1)]
     return {
         "version": 2,
         "tonemapping": "none",
@@ -165,7 +196,9 @@ def settings(
         "postEffectSettings": _NO_EFFECTS,
         "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
         "cameras": [{"initial": cameras[start]}],
-        "annotations": [_bookmark(names[n], cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n in marked],
+        "annotations": [
+            _bookmark(title, text, cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n, title, text in marked
+        ],
         "startMode": "default" if path is None else "animTrack",
     }
 
@@ -176,6 +209,16 @@ def _depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarr
         return np.full(len(poses), max(poses.spread or distance, 1e-3))
     ahead = ((focus - poses.positions) * poses.forward).sum(axis=1)
     return np.where(ahead > 0, ahead, np.median(ahead))
+
+
+def limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:
+    """Opposite corners, in the viewer's world, of where guests may go: the cameras' box, and somewhat beyond it.
+
+    depth: of what the cameras look at.
+    """
+    places = poses.positions @ axes.T
+    room = depth * np.array([_ASIDE, _UNDER, _ASIDE])
+    return [(places.min(axis=0) - room).tolist(), (places.max(axis=0) + depth * _ASIDE).tolist()]
 
 
 def lean(turn: np.ndarray) -> float:
@@ -193,16 +236,15 @@ def _look(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float
     return {"position": (axes @ position).tolist(), "target": (axes @ target).tolist(), "fov": float(fov)}
 
 
-def _bookmark(name: str, camera: dict[str, Any], degrees: float, aspect: float) -> dict[str, Any]:
+def _bookmark(name: str, text: str, camera: dict[str, Any], degrees: float, aspect: float) -> dict[str, Any]:
     """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean.
 
     aspect: of the photo, which the page lets fill a window's width.
     """
-    title = name if len(name) <= _TITLE else "…" + name[1 - _TITLE :]
     return {
         "position": camera["position"],
-        "title": title,
-        "text": "",
+        "title": name if len(name) <= _TITLE else name[: _TITLE - 1] + "…",
+        "text": text,
         "camera": {"initial": camera},
         "extras": {"lean": degrees, "aspect": aspect},
     }

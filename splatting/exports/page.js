@@ -13,18 +13,60 @@ const unpacked = (id) => {
 };
 
 // The viewer takes opening angles across the longer side of the window; the settings have vertical ones. A photo of
-// another aspect fills the window's width, as nobody has seen what is beside it, but half of its height is shown at least.
+// another aspect fills the window's width, as nobody has seen what is beside it, but most of its height is shown.
 const fit = (degrees, photo = Infinity) => {
-  const aspect = innerWidth / innerHeight, shown = Math.max(Math.min(1, photo / aspect), 0.5);
+  const aspect = innerWidth / innerHeight, shown = Math.max(Math.min(1, photo / aspect), 0.85);
   return Math.atan(Math.tan(degrees * Math.PI / 360) * shown * Math.max(aspect, 1)) * 360 / Math.PI;
 };
 
-// The viewer keeps whether its help is open. On a small screen with touch it would cover the model, so it begins closed.
+// The viewer keeps whether its help is open. It would cover a part of the model, so it begins closed.
 const closeHelp = () => {
   const key = 'controlsPanelOpen';
   try {
-    if (matchMedia('(pointer: coarse)').matches && localStorage.getItem(key) === null) localStorage.setItem(key, 'false');
+    if (localStorage.getItem(key) === null) localStorage.setItem(key, 'false');
   } catch { /* nothing is kept on this machine */ }
+};
+
+// The viewer asks for what is solid by an address; the answer is in this file.
+const answer = ({ address, about }) => {
+  const content = unpacked('solid'), elsewhere = window.fetch.bind(window);
+  window.fetch = (asked, ...rest) => {
+    if (asked === address) return Promise.resolve(new Response(about));
+    return asked === address.replace('.json', '.bin') ? Promise.resolve(content) : elsewhere(asked, ...rest);
+  };
+};
+
+// Nobody leaves what the photos show: beyond the limits the camera stands still, and the wheel leads no further. Who
+// walks is kept by rails.
+const limited = (viewer, [least, most]) => {
+  const camera = viewer.app.root.findByName('camera');
+  let outside = false;
+  addEventListener('wheel', (event) => { if (outside && event.deltaY > 0) event.stopPropagation(); }, { capture: true });
+  return () => {
+    if (viewer.state.xrMode || ['anim', 'walk'].includes(viewer.state.cameraMode)) return;
+    const place = camera.getPosition(), { x, y, z } = place;
+    place.set(...[x, y, z].map((value, i) => Math.min(Math.max(value, least[i]), most[i])));
+    outside = place.x !== x || place.y !== y || place.z !== z;
+    if (outside) camera.setPosition(place);
+  };
+};
+
+// In a headset a guest stands where the picture was taken, and looks ahead; the viewer itself would begin on the plane
+// y = 0 and might face the other way. metre: in units of the model.
+const standing = (viewer, metre) => {
+  const camera = viewer.app.root.findByName('camera'), rig = camera.parent, eyes = 1.6;
+  let place, yaw;
+  viewer.events.on('xrMode:changed', (mode) => {
+    rig.setLocalScale(...Array(3).fill(mode ? metre : 1));
+    if (!mode) return;
+    rig.setPosition(place.x, place.y - eyes * metre, place.z);
+    rig.setEulerAngles(0, yaw, 0);
+  });
+  return () => {
+    if (viewer.state.xrMode) return;
+    place = camera.getPosition().clone();
+    yaw = Math.atan2(-camera.forward.x, -camera.forward.z) * 180 / Math.PI;
+  };
 };
 
 // The viewer's cameras are level, and those of the photos were not always. At a bookmark the picture leans as its photo
@@ -39,6 +81,7 @@ const leaning = (viewer, annotations) => {
   const camera = viewer.app.root.findByName('camera');
   let shown = null;
   return (seconds) => {
+    if (viewer.state.xrMode) return;
     const { x, y, z } = camera.getPosition(), { forward } = camera;
     let wanted = 0, most = 0;
     for (const mark of viewer.state.cameraMode === 'anim' ? [] : bookmarks) {
@@ -51,22 +94,29 @@ const leaning = (viewer, annotations) => {
   };
 };
 
+// Whether a headset is there, which draws by WebGL alone. A frame may not ask.
+const headset = () => window === window.top && navigator.xr?.isSessionSupported('immersive-vr').catch(() => false);
+
 try {
   // Angles are fitted to the size of the window. In a frame this runs before there is a size; a hidden frame has none.
   while (!innerWidth || !innerHeight) await new Promise(requestAnimationFrame);
-  const { antialiasing, aspect, name, settings } = JSON.parse(document.getElementById('page').textContent);
+  const { antialiasing, aspect, limits, metre, name, settings, solid } = JSON.parse(document.getElementById('page').textContent);
   for (const { initial } of settings.cameras) initial.fov = fit(initial.fov, aspect);
   for (const { camera: { initial }, extras } of settings.annotations) initial.fov = fit(initial.fov, extras.aspect);
   for (const { keyframes: { values } } of settings.animTracks) values.fov = values.fov.map((degrees) => fit(degrees));
   closeHelp();
+  if (solid) answer(solid);
   const code = new Blob([await unpacked('viewer').text()], { type: 'text/javascript' });
   const { createViewer } = await import(URL.createObjectURL(code));
   // The name is given, too, as the viewer cannot take it from an address in a frame whose own is about:srcdoc.
   const viewer = await createViewer({
     container: document.body, settings, contentUrl: name, contentFilename: name,
-    contents: Promise.resolve(unpacked('model')), noanim: true,
+    contents: Promise.resolve(unpacked('model')), noanim: true, collisionUrl: solid?.address,
+    renderer: (await headset()) ? 'webgl' : undefined,
   });
   viewer.app.scene.gsplat.antiAlias = antialiasing;
+  viewer.app.on('update', limited(viewer, limits));
+  viewer.app.on('update', standing(viewer, metre));
   viewer.app.on('update', leaning(viewer, settings.annotations));
   const begin = () => viewer.resetCamera(); // at the first camera; the viewer itself begins in its animation
   viewer.state.loaded ? begin() : viewer.events.once('loaded:changed', begin);

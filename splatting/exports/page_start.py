@@ -21,7 +21,7 @@ from splatting.files.ours import write_picture
 from splatting.host.listing import some
 from utils.system_utils import UserError
 
-LEAST = 0.5  # of a photo's height that is shown, however wide the window is
+LEAST = 0.85  # of a photo's height that is shown, however wide the window is
 PICTURE = 1200, 630  # px, as services ask for
 _QUALITY = 88  # of its JPEG
 _ALIKE = 1e-3  # scores that differ by less are equal
@@ -44,12 +44,12 @@ def best_start(poses: Poses) -> int:
     return int(np.argmax(scores <= scores.min() + _ALIKE))
 
 
-def named_start(name: str, names: Sequence[str]) -> int:
-    """The camera of a photo, whose name may lack its ending. UserError if there is none."""
+def named(name: str, names: Sequence[str], said: str) -> int:
+    """The camera of a photo, whose name may lack its ending. UserError if there is none, with `said`."""
     for found in (list(names), [os.path.splitext(one)[0] for one in names]):
         if name in found:
             return found.index(name)
-    raise UserError(f"--start {name} is no training photo; there are {some(names)}")
+    raise UserError(f"{said} is no training photo; there are {some(names)}")
 
 
 def narrowed(fov: float, photo: float, window: float) -> float:

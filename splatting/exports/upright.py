@@ -126,4 +126,5 @@ def moved_around(around: Any, similarity: Similarity) -> Any:
     if not cameras:
         return around
     make_moved = make and (lambda _: MovedPath(make(poses_of(cameras)), similarity))
-    return around._replace(cameras=moved_cameras(cameras, similarity), make_path=make_moved, upright=similarity.upright)
+    moved = {"cameras": moved_cameras(cameras, similarity), "make_path": make_moved}
+    return around._replace(**moved, upright=similarity.upright, metric=similarity.metric)

@@ -22,7 +22,7 @@ class Similarity:
 
     There y is down, as in a usual capture. rotation: (3,3). place: latitude and longitude (degrees) and height (metres)
     of the origin, where x is east and z north, in metres; empty: unknown. upright: the vertical is known; else only the
-    scale changes.
+    scale changes. metric: a unit is a metre then.
     """
 
     rotation: np.ndarray
@@ -30,6 +30,7 @@ class Similarity:
     translation: np.ndarray
     place: tuple[float, ...] = ()
     upright: bool = True
+    metric: bool = False
 
     @classmethod
     def of(cls, record: Any, where: str) -> "Similarity":
@@ -48,7 +49,9 @@ class Similarity:
                 f"{where} has no rotation, scale and translation of a similarity that a scene may have; run convert.py "
                 "--orient again"
             ) from error
-        return cls(rotation, scale, translation, place, record.get("vertical", "") is not None)
+        return cls(
+            rotation, scale, translation, place, record.get("vertical", "") is not None, record.get("unit") == "metre"
+        )
 
     def from_local(self, offset: np.ndarray) -> "Similarity":
         """The similarity for coordinates from which an offset (3,) of the world was subtracted."""

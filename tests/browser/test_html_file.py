@@ -1,25 +1,31 @@
 """One-file HTML of a model in a real browser, opened from disk."""
 
 import html
+import json
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from gaussians import pipeline
 from html_scene import FOV, SIZE, balls, cameras
+from room_scene import HALF, STEP, room
+from room_scene import cameras as in_room
 from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
+from test_html_export import Page as HtmlPage
 
 from gaussian_renderer.free_view import free_view
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.html import write_html
 from splatting.exports.page_start import narrowed
+from splatting.exports.walking import EYES, solid_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Frame, Page
 
 pytestmark = pytest.mark.browser
 WINDOW = SIZE
-BARE = ".sse-viewer > :not(canvas) { display: none !important }"  # the picture without buttons
+BARE = ".sse-viewer > :not(canvas), #about { display: none !important }"  # the picture without buttons
 
 
 def show(tab: "Page", path: Path) -> None:
@@ -79,7 +85,7 @@ def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
 def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, height):
-    """Nothing beside the photo is shown; on a phone the help, which covers the model, begins closed."""
+    """Nothing beside the photo is shown; the help, which covers the model, begins closed."""
     phone = width < height
     context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
     tab = context.new_page()
@@ -89,13 +95,51 @@ def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, heigh
     fov, (position, turn) = narrowed(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
     view = free_view(width, height, fov, position, turn, "cpu")
     assert psnr(shown, expected(splats, view)) > 31
-    assert tab.locator(".sse-controlsHint").evaluate("e => e.classList.contains('sse-hidden')") == phone
+    assert tab.locator(".sse-controlsHint").evaluate("e => e.classList.contains('sse-hidden')")
     context.close()
 
 
 def placed(camera) -> tuple[list[float], list[float]]:
     poses = poses_of([camera])
     return poses.positions[0].tolist(), poses.quaternions[0].tolist()
+
+
+def place_of(tab: "Page") -> list[float]:
+    return tab.evaluate("(({ x, y, z }) => [x, y, z])(viewer.app.root.findByName('camera').getPosition())")
+
+
+def test_nobody_leaves_what_photos_show(tab, page):
+    show(tab, page)
+    tab.mouse.move(200, 150)
+    places = []
+    for _ in range(2):
+        for _ in range(15):
+            tab.mouse.wheel(0, 400)
+            tab.wait_for_timeout(20)
+        tab.wait_for_timeout(600)
+        places.append(place_of(tab))
+    least, most = json.loads(HtmlPage(page).texts["page"])["limits"]
+    assert all(low - 1e-3 <= x <= high + 1e-3 for low, x, high in zip(least, places[1], most, strict=True))
+    assert places[1] == pytest.approx(places[0], abs=1e-3) and math.dist(places[1], placed(cameras()[0])[0]) > 0.5
+
+
+def test_guests_walk_on_the_floor_and_stop_at_walls(tab, tmp_path):
+    path = tmp_path / "room.html"
+    write_html(path, room(), in_room(), upright=True, metric=True, solid=solid_of(room(), in_room(), pipeline()))
+    show(tab, path)
+    for _ in range(50):
+        if tab.evaluate("viewer.state.walkAllowed"):
+            break
+        tab.wait_for_timeout(100)
+    tab.evaluate("viewer.toggleWalk()")
+    tab.wait_for_timeout(2000)
+    _, on_floor, start = place_of(tab)
+    tab.evaluate("viewer.setMoveInput(0, 1)")
+    tab.wait_for_timeout(4000)
+    _, on_step, wall = place_of(tab)
+    assert start == pytest.approx(0, abs=0.05) and on_floor == pytest.approx(EYES, abs=0.06)
+    assert on_step == pytest.approx(EYES + STEP[0], abs=0.12)
+    assert HALF - 0.3 < abs(wall) < HALF - 0.15  # a walker has a radius of 0.2 m
 
 
 def test_a_damaged_page_says_so(browser, page, tmp_path):
