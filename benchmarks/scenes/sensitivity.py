@@ -32,7 +32,7 @@ OPTIONS = (
 )
 FROM_ONE = ("opacity_decay", "SETTLING")  # whose distance from 1 is halved and doubled
 ATTRIBUTES = {
-    "Budget.band_rate": "splatting.parts.budget",
+    "MOST_BAND_RATE": "scene.gaussians.density_rules",
     "SQUARES": "splatting.parts.budget",
     "LONGER": "splatting.training.schedule",
     "MOST_RATE": "splatting.training.schedule",
@@ -59,14 +59,7 @@ def value_of(constant: str) -> float:
 
     if constant in OPTIONS:
         return vars(training_parser()[0].parse_args([]))[constant]
-    return getattr(*place(constant))
-
-
-def place(constant: str) -> tuple[Any, str]:
-    """The module or class that has a constant, and its name there."""
-    owner, _, name = constant.rpartition(".")
-    module = importlib.import_module(ATTRIBUTES[constant])
-    return getattr(module, owner) if owner else module, name
+    return getattr(importlib.import_module(ATTRIBUTES[constant]), constant)
 
 
 def changed(constant: str, factor: float) -> float:
@@ -87,7 +80,8 @@ def train_with(job: Job, words: Sequence[str], gpus: Any) -> float:
     if job.constant in OPTIONS:
         options = [f"--{job.constant}", str(changed(job.constant, job.factor))]
     elif job.constant:
-        setattr(*place(job.constant), changed(job.constant, job.factor))
+        module = importlib.import_module(ATTRIBUTES[job.constant])
+        setattr(module, job.constant, changed(job.constant, job.factor))
     try:
         with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
             base = ["-s", job.scene, "-m", out, "--eval", "--quiet", "--disable_viewer", "--no_last_checkpoint"]

@@ -26,12 +26,22 @@ MIN_OPACITY = 0.005  # a Gaussian below it is removed
 MAX_SCREEN_SIZE = 20  # pixels
 PIXELS = 64  # training pixels of all views for each Gaussian of the default budget
 FEWEST, MOST = 100_000, 1_000_000  # Gaussians of the default budget
+FEW_PHOTOS = 50  # to which trainings overfit
+MOST_BAND_RATE = 2.0
 
 
 def default_budget(cameras: Sequence[Any]) -> int:
     """The number of Gaussians to reach where --max_num_splats is 0: one for PIXELS pixels, from FEWEST to MOST."""
     pixels = sum(camera.image_width * camera.image_height for camera in cameras)
     return min(max(pixels // PIXELS, FEWEST), MOST)
+
+
+def band_rate(cameras: Sequence[Any]) -> float:
+    """Factor of the learning rate of SH bands above degree 0: 1 for FEW_PHOTOS, and in proportion for others.
+
+    Few photos see a Gaussian from few sides, and bands soon fit what is only in them.
+    """
+    return min(len(cameras) / FEW_PHOTOS, MOST_BAND_RATE)
 
 
 class Actions(NamedTuple):

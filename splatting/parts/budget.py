@@ -5,7 +5,7 @@ long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as
 no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight over several
 views, and nothing else counts. Gaussians are drawn by their scores without replacement, not the highest taken. Children
 keep their parent's mean and covariance. Opacities are multiplied by a factor, where Rota Bulo et al. subtract a
-constant. Adam averages squared gradients over fewer iterations, and SH bands learn twice as fast.
+constant. Adam averages squared gradients over fewer iterations, and SH bands learn faster from many photos.
 """
 
 import math
@@ -42,7 +42,6 @@ class Budget(Strategy):
     removes = True
     fusable = True
     clamps = False
-    band_rate = 2.0
     # fmt: off
     options = Options(optimisation=(
         Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
@@ -57,7 +56,7 @@ class Budget(Strategy):
         return True
 
     def begin(self, run: Any, state: Any) -> None:
-        from scene.gaussians.density_rules import default_budget
+        from scene.gaussians.density_rules import band_rate, default_budget
         from splatting.parts.budget_rules import error_scores
 
         super().begin(run, state)
@@ -65,6 +64,7 @@ class Budget(Strategy):
         self.ends = run.opt.densify_until_iter
         self._scores = partial(error_scores, run.gaussians, run.pipe, run.gaussians.exposures.applied)
         self.max_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+        self.band_rate = band_rate(self._cameras)
 
     def rate_factor(self, iteration: int) -> float:
         """Learning rates follow the number of iterations, and fall at the end."""

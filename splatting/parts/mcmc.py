@@ -3,7 +3,7 @@
 Gaussians are taken for samples of a distribution, and training for a random walk among them. What departs from the
 paper: opacities and scales are penalised by their means, as in the authors' release, where the paper writes sums;
 Adam's averages restart for the moved Gaussians as well as for those that they come to; a step and its penalties concern
-what the view sees; and SH bands learn twice as fast in long trainings.
+what the view sees; and SH bands learn faster from many photos.
 """
 
 from collections.abc import Collection
@@ -19,8 +19,7 @@ _PAPER = "ours, from the MCMC paper"
 _RELEASED = "ours, from the release of the MCMC paper"
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
-BAND_RATES = (2.0, 1.0)  # likewise, as rates of the latter are higher already
-FEW, SECONDS = 50, 0.25  # training photos; seconds for each: 250 iterations on a GPU (docs/guide/strategies.md)
+SECONDS = 0.25  # for each training photo, at least: 250 iterations on a GPU (docs/guide/strategies.md)
 
 
 def _between(value: float) -> str | None:
@@ -65,20 +64,23 @@ class Mcmc(Strategy):
 
     @classmethod
     def best_in(cls, seconds: float, run: Any) -> bool:
+        from scene.gaussians.density_rules import FEW_PHOTOS
+
         views = run.scene.getTrainCameras()
-        few = len(views) <= FEW and seconds >= SECONDS * len(views)
+        few = len(views) <= FEW_PHOTOS and seconds >= SECONDS * len(views)
         return few and run.device.type == "cuda"
 
     def begin(self, run: Any, state: Any) -> None:
-        from scene.gaussians.density_rules import default_budget
+        from scene.gaussians.density_rules import band_rate, default_budget
         from scene.gaussians.penalty import Penalty
 
         super().begin(run, state)
         self._gaussians, opt = run.gaussians, run.opt
         self._opt, self.ends = opt, opt.mcmc_until_iter
         paced = run.schedule.paced
-        self.band_rate = BAND_RATES[paced]
-        default = default_budget(run.scene.getTrainCameras()) if paced else MOST_GAUSSIANS
+        cameras = run.scene.getTrainCameras()
+        self.band_rate = band_rate(cameras)
+        default = default_budget(cameras) if paced else MOST_GAUSSIANS
         self.max_gaussians = opt.max_num_splats or default
         # Penalties need time; with little of it they only darken (fox_tiny, 1,243 iterations: -1.7 dB), except where
         # they clear away random points (nerf_lego200_tiny, 346 iterations: +17 dB).

@@ -18,7 +18,7 @@ from gaussian_renderer import model_inputs, rasterizer_settings
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adc import remove_useless
-from scene.gaussians.density_rules import default_budget
+from scene.gaussians.density_rules import band_rate, default_budget
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.deterministic.counter_rng import Stream
@@ -317,3 +317,8 @@ def test_fewer_iterations_average_squared_gradients_over_fewer(iterations, beta2
     block = Block(iterations, 0.0, 1 / iterations, 0.0)
     for schedule in (Schedule(iterations), DecidedSchedule(Decided(30_000, [block], iterations, 0.0))):
         assert begun("budget", schedule=schedule).beta2(iterations) == pytest.approx(beta2)
+
+
+def test_bands_learn_slowly_from_few_photos():
+    assert [band_rate([None] * count) for count in (10, 50, 75, 100, 1000)] == [0.2, 1.0, 1.5, 2.0, 2.0]
+    assert begun("budget").band_rate == begun("mcmc").band_rate < 1
