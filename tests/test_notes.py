@@ -44,6 +44,7 @@ def test_a_file_of_notes_has_a_title_facts_text_and_views(written):
     [
         (b"## Here\nText", "“Here” has no camera; write camera: PHOTO"),
         (b"## Here\ncamera: a.jpg\n" + 1001 * b"x", "“Here” has 1,001 letters; shorten it to 1,000"),
+        (26 * b"## Here\ncamera: a.jpg\n", "has 26 views, and a page takes 25; remove some"),
         (b"\xff\xfe", "cannot be read as UTF-8 text"),
         (None, "cannot be read as UTF-8 text"),
     ],

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from splatting.host.errors import UserError
 
+_MOST = 25  # views, which the viewer takes
 _LONGEST_TEXT = 1000  # letters of a note, which the viewer shows in a box
 _FACT = re.compile(r"([^\W\d_][\w ]{0,30}):\s+(\S.*)")
 
@@ -59,6 +60,8 @@ def read_notes(path: str) -> Notes:
         if len(words) > _LONGEST_TEXT:
             raise UserError(f"--notes {path}: “{heading}” has {len(words):,} letters; shorten it to {_LONGEST_TEXT:,}")
         views.append(Note(heading.strip(), words, camera))
+    if len(views) > _MOST:
+        raise UserError(f"--notes {path} has {len(views)} views, and a page takes {_MOST}; remove some")
     return Notes(title, facts, text, tuple(views))
 
 
