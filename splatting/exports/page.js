@@ -14,9 +14,21 @@ const unpacked = (id) => {
 
 // The viewer takes opening angles across the longer side of the window; the settings have vertical ones. A photo of
 // another aspect fills the window's width, as nobody has seen what is beside it, but most of its height is shown.
+const least = 0.85;
 const fit = (degrees, photo = Infinity) => {
-  const aspect = innerWidth / innerHeight, shown = Math.max(Math.min(1, photo / aspect), 0.85);
+  const aspect = innerWidth / innerHeight, shown = Math.max(Math.min(1, photo / aspect), least);
   return Math.atan(Math.tan(degrees * Math.PI / 360) * shown * Math.max(aspect, 1)) * 360 / Math.PI;
+};
+
+// Beside a photo that does not fill the window nobody saw much: the sides fade out until a guest moves.
+const fadeSides = (photo) => {
+  const side = 50 * (1 - photo / least / (innerWidth / innerHeight));
+  if (side <= 0) return;
+  const sides = document.querySelector('.sse-sceneLayer').appendChild(document.createElement('div'));
+  const color = getComputedStyle(document.body).backgroundColor;
+  sides.style = `position: absolute; inset: 0; pointer-events: none; transition: opacity 1s; background:
+    linear-gradient(90deg, ${color}, transparent ${side}%, transparent ${100 - side}%, ${color})`;
+  for (const moved of ['pointerdown', 'wheel', 'keydown']) addEventListener(moved, () => sides.style.opacity = 0, true);
 };
 
 // The viewer keeps whether its help is open. It would cover a part of the model, so it begins closed.
@@ -115,6 +127,7 @@ try {
     renderer: (await headset()) ? 'webgl' : undefined,
   });
   viewer.app.scene.gsplat.antiAlias = antialiasing;
+  fadeSides(aspect);
   viewer.app.on('update', limited(viewer, limits));
   viewer.app.on('update', standing(viewer, metre));
   viewer.app.on('update', leaning(viewer, settings.annotations));
