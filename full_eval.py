@@ -3,8 +3,8 @@
 python full_eval.py -m360 DIR -tat DIR -db DIR [--output_path DIR]
 python full_eval.py --scenes FOLDER ... [--iterations N] [--seeds 0 1 2] [--configs FILE] [--gpus 0 1] [-- OPTIONS]
 
-Writes report.md, report.json, report.html, figures/ and timing.txt into the output folder, and a model folder for every
-run: <scene>[/<option set>][/seed_N]; with --html_models also models/, each model as one HTML file. After an
+Writes report.html, .md, .json, .csv and .tex, figures/ and timing.txt into the output folder, and a model folder for
+every run: <scene>[/<option set>][/seed_N]; with --html_models also models/, each model as one HTML file. After an
 interruption, the same command resumes. Another command with the same output folder adds its runs to the report.
 """
 
@@ -226,7 +226,7 @@ def _report(
     named = {(peer["scene"], peer["name"]): peer for peer in (*earlier["peers"], *peers) if peer["scene"] in scenes}
     report = make_report(command, results, list(named.values()), earlier["commands"])
     write_report(report, output)
-    for table in result_tables(report["summary"], MAIN):
+    for table in result_tables([*report["summary"], *report["means"]], MAIN):
         print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
     for scene, found in report["gains"].items():
         print(f"\n{scene}: gain in test PSNR over {found['default']} on the same seeds\n{_text(gains_table(found))}")

@@ -12,6 +12,7 @@ from splatting.evaluation.comparison import (
     compare,
     default_set,
     published_tables,
+    scene_means,
     spread,
     stand_apart,
     summarise,
@@ -30,6 +31,26 @@ def test_spread():
     assert spread([1.0, 2.0, 4.0]) == {"mean": pytest.approx(7 / 3), "std": std, "values": [1.0, 2.0, 4.0]}
     assert spread([5.0])["std"] is None and spread([5.0])["mean"] == 5.0
     assert spread([5.0, None])["mean"] is None and spread([])["mean"] is None
+
+
+def test_means_over_the_scenes_that_compare():
+    """Over all of them or none; spread over seeds where these are the same; those of a data set by its name."""
+    other = [run | {"seed": run["seed"] + 5} for run in set_runs("brick") if run["config"] == "fast"]
+    runs = [*set_runs(), *(run for run in set_runs("brick") if run["config"] == "adc"), *other]
+    runs[2] = runs[2] | {"iterations": {"30": runs[2]["iterations"]["30"] | {"gaussians": None}}}
+    adc, fast = scene_means(summarise(stand_apart(runs)))  # and `small` is of one scene
+    assert (adc["scene"], adc["config"], adc["scenes"], adc["seeds"]) == ("mean of 2 scenes", "adc", 2, [0, 1])
+    assert adc["PSNR"] == spread([31.0, 31.4]) and fast["seeds"] == [None] and fast["PSNR"]["mean"] == 32.2
+    assert fast["PSNR"]["std"] is None and fast["gaussians"]["mean"] is None
+    (table,) = result_tables([adc, fast])
+    assert table.rows[0][:4] == ["mean of 2 scenes", "adc", "30", "31.20 ± 0.28"] and table.rows[1][-1] == "-"
+    runs[-2:] = [run | {"ground_truth_sha256": "b" * 64} for run in runs[-2:]]  # `fast` of a scene
+    assert [mean["config"] for mean in scene_means(summarise(stand_apart(runs)))] == ["adc"]
+    tanks = [run | {"group": "tanksandtemples"} for name in ("truck", "train") for run in set_runs(name)]
+    assert {mean["scene"] for mean in scene_means(summarise(tanks))} == {"mean of tanksandtemples"}
+    part = [run | {"group": "mipnerf360", "open_ended": True} for name in ("garden", "room") for run in set_runs(name)]
+    (mean, *_) = scene_means(summarise(part))
+    assert mean["scene"] == "mean of 2 scenes of mipnerf360" and mean["iteration"] is None
 
 
 @pytest.mark.parametrize(

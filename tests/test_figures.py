@@ -80,8 +80,8 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
 
 
 def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
-    """Other programs, which score all views, are told from them."""
-    whole = curve((9.0, 50.0, 0.99))
+    """But for the end of a line, which is the score. Other programs, which score all views, are told from them."""
+    whole = [curve((9.0, 50.0, 0.99))[0] | {"iteration": 2}]
     curves = [curve((t, p, 0.8, None, None, n), (9.0, p + 1, 0.9, None, None, n)) for t, p, n in
               ((1.0, 20.0, 2), (2.0, 22.0, 2), (3.0, 24.0, 4))]  # fmt: skip
     peer = {"name": "other", "curve": curve((0.5, 40.0))}
@@ -91,7 +91,7 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     draw_curves(tmp_path, "attic", [*runs_of({name: curves[i] for i, name in enumerate("ab")}), apart])
     assert drawn[4].legends[0].get_title().get_text().startswith("2 of ")
     same, mixed = drawn[0].axes[0], drawn[2].axes[0]
-    assert points(same, "b") == [[[2.0, 22.0], [9.0, 23.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
+    assert points(same, "b") == [[[2.0, 22.0], [9.0, 50.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
     said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
-    assert said == ["2 of 7 test views; hollow and other programs: all of them", "all 7 test views"]
+    assert said == ["2 of 7 test views; hollow, other programs and the end: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)

@@ -315,7 +315,15 @@ def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
     assert second["split"] == "every 8th by name" and second["lines"] == records[-1]["lines"]
     text = evaluate.text("md")
     assert "17,000" in text and "16,000" not in text and "Gaussians are counted as trained" in text
-    assert "every 8th by name" in text and "attic: Curve of 14 points. Saved 9 of 10 Gaussians." in text
+    assert "every 8th by name" in text and "Curve of" not in text  # of one training, all say the same
+    evaluate("brick")
+    records[-1]["lines"] = [f"Curve of 9 points: {evaluate.out}/brick/curve.png", "Its photos differ"]
+    (evaluate.out / "brick" / "train_log.json").write_text(json.dumps(records))
+    records[-1]["lines"] = [f"Curve of 14.5 points: {evaluate.out}/attic/curve.png", "warning: of the start"]
+    (model / "train_log.json").write_text(json.dumps(records))
+    evaluate("attic brick")
+    text = evaluate.text("md")
+    assert "\nbrick: Its photos differ.\n" in text and "Curve of" not in text and "\nattic: of the start\n" in text
     write_cfg_args(tmp_path, argparse.Namespace())
     assert shorter_ends_there(tmp_path)  # as a schedule of --iterations does not
     (tmp_path / SCHEDULE).touch()
@@ -349,7 +357,7 @@ def test_seeds_and_option_sets(evaluate, tmp_path, capsys):
     assert report["gains"]["attic"]["default"] == "base" and report["gains"]["attic"]["sets"].keys() == {"sh1"}
     said, text = capsys.readouterr().out, evaluate.text("md")
     assert "attic: gain in test PSNR over base" in said and "23.10 ± 0.14" in said
-    assert "### Gain over base on the same seeds" in text
+    assert "\nGain over base on the same seeds.\n" in text
     assert "(figures/attic_worst_views.png)" in text
 
 
@@ -428,8 +436,9 @@ def test_a_second_call_with_other_scenes_or_seeds_joins_the_report(evaluate):
     assert [run["scene"] for run in second["runs"]] == ["attic", "brick"] and second["runs"][0] == first["runs"][0]
     assert second["manifest"]["earlier_commands"] == [first["manifest"]["command"]]
     assert evaluate("attic")["runs"] == second["runs"]
-    text = evaluate.text("md")  # with two tables
-    assert text.count("| attic |") == text.count("| brick |") == 3 and (evaluate.out / "timing.txt").read_text()
+    rows = [line.split("|")[1].strip() for line in evaluate.text("md").splitlines() if line.startswith("|")]
+    assert rows.count("attic") == rows.count("brick") == 3 and rows.count("mean of 2 scenes") == 2  # of three tables
+    assert (evaluate.out / "timing.txt").read_text()
     evaluate("cellar", "--seeds", 1)
     report = evaluate("cellar", "--seeds", 2)
     (row,) = [row for row in report["summary"] if row["scene"] == "cellar"]
@@ -470,6 +479,7 @@ def test_names_stay_names_in_the_report(figures, evaluate):
     text = evaluate.text("md")
     assert [evaluate.text(kind).count("<script") for kind in ("md", "html")] == [0, 1]
     assert "<script>alert" not in evaluate.text("html") and "[x](" not in text
+    assert "caf\\udce9" in evaluate.text("csv") and "caf\\textbackslash{}udce9" in evaluate.text("tex")
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len(rows) == 9 and len({line.count("|") for line in rows[:3]}) == 1  # header, rule and row of three tables
     assert not any(line.startswith("# a") for line in text.splitlines())
@@ -479,8 +489,11 @@ def test_names_stay_names_in_the_report(figures, evaluate):
 
 def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeypatch):
     (attic,) = evaluate("attic")["runs"]
-    html = evaluate.text("html")
+    html = evaluate.text("html").replace(lpips_utils._url("vgg"), "the address of LPIPS's weights", 1)
     assert "http:" not in html and "https:" not in html  # needs nothing else
+    assert "the address of LPIPS's weights into a folder, and repeat the command with --weights FOLDER" in html
+    captions = re.findall("<figcaption>(.*?)</figcaption>", html)
+    assert len(captions) == html.count('<div class="scroll">') - 1 and all(captions)  # but of the list of views
     assert all(part.startswith("data:image/") for part in html.split('src="')[1:])
     (page,) = re.findall(r"<h2>attic</h2>(.*)<h2>", html, re.DOTALL)
     shown = re.findall(r'<figure class="comparison">.*?</figure>', page, re.DOTALL)

@@ -108,18 +108,32 @@ def _moments(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], 
     return [*rows, *([ended] if ended else [])]
 
 
-def dataset_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return means over the scenes of a data set, for each option set and iteration that all its scenes have.
+def scene_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return rows of means over the scenes of a data set, for each option set and iteration that all of them have.
 
-    iteration: null where the trainings ended by themselves.
+    They are like those of `summarise`, with the number of `scenes`. Where these have the same seeds, a mean is spread
+    over them, too. iteration: null where the trainings ended by themselves.
     """
-    rows = [row | {"iteration": None} if row["open_ended"] else row for row in rows if row["group"] in DATASETS]
-    means = []
-    for (group, config, iteration), members in grouped(rows, "group", "config", "iteration").items():
-        if {row["scene"] for row in members} == DATASETS[group].keys():
-            mean = {name: spread(row[name]["mean"] for row in members)["mean"] for name in QUANTITIES}
-            means.append({**mean, "config": config, "group": group, "iteration": iteration})
+    means, scenes = [], {group: {row["scene"] for row in there} for group, there in grouped(rows, "group").items()}
+    comparable = (row | {"iteration": None} if row["open_ended"] else row for row in rows if not row["apart"])
+    for (group, config, iteration), members in grouped(comparable, "group", "config", "iteration").items():
+        count = len(scenes[group])
+        if count < 2 or {row["scene"] for row in members} != scenes[group]:
+            continue
+        seeds = members[0]["seeds"] if all(row["seeds"] == members[0]["seeds"] for row in members) else [None]
+        of = "" if group not in DATASETS else f" of {group}"
+        mean = {name: _over_scenes([row[name] for row in members], len(seeds)) for name in QUANTITIES}
+        mean |= {"apart": False, "config": config, "group": group, "iteration": iteration, "scenes": count}
+        whole = scenes[group] == DATASETS.get(group, {}).keys()
+        means.append(mean | {"scene": f"mean{of}" if whole else f"mean of {count} scenes{of}", "seeds": seeds})
     return means
+
+
+def _over_scenes(spreads: Sequence[dict[str, Any]], seeds: int) -> dict[str, Any]:
+    """Return the spread of the mean over scenes. spreads: of a quantity, of each scene. seeds: 1 if they differ."""
+    if seeds == 1 or any(one["mean"] is None for one in spreads):
+        return spread([None if None in (means := [one["mean"] for one in spreads]) else statistics.fmean(means)])
+    return spread(map(statistics.fmean, zip(*(one["values"] for one in spreads), strict=True)))
 
 
 def stand_apart(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -203,8 +217,8 @@ def compare(
 ) -> list[dict[str, Any]]:
     """Compare our numbers with each published one of the same scene (or mean of a data set) and iteration.
 
-    runs, rows, means: those of report.json (`runs`, `summary`, `dataset_means`). In the result, `other_options` has the
-    options of our training that the table's did not have (null: not known); they may explain a difference.
+    runs, rows, means: those of report.json (`runs`, `summary`, `means`). In the result, `other_options` has the options
+    of our training that the table's did not have (null: not known); they may explain a difference.
     """
     compared = []
     for table in published_tables():
@@ -212,13 +226,12 @@ def compare(
             ours = [run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"])]
             theirs = table["scenes"].get(row["scene"], {}).get(str(None if row["open_ended"] else row["iteration"]))
             if theirs and row["group"] in table["groups"] and _meets(ours[0], table.get("requires", {})):
-                numbers = {name: row[name]["mean"] for name in COMPARED}
-                compared.append(_comparison(table, row | numbers, row["scene"], theirs, ours))
+                compared.append(_comparison(table, row, theirs, ours))
         for mean in means:
             theirs = table["means"].get(mean["group"], {}).get(str(mean["iteration"]))
-            if theirs:
+            if theirs and mean["scenes"] == len(DATASETS[mean["group"]]):
                 ours = [run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"])]
-                compared.append(_comparison(table, mean, f"mean of {mean['group']}", theirs, ours))
+                compared.append(_comparison(table, mean, theirs, ours))
     return compared
 
 
@@ -231,14 +244,15 @@ def _meets(run: dict[str, Any], required: dict[str, Any]) -> bool:
 
 
 def _comparison(
-    table: dict[str, Any], ours: dict[str, Any], scene: str, theirs: dict[str, float], runs: list[dict[str, Any]]
+    table: dict[str, Any], ours: dict[str, Any], theirs: dict[str, float], runs: list[dict[str, Any]]
 ) -> dict[str, Any]:
+    """ours: a row of `summarise` or `scene_means`."""
     numbers = {
-        name: {"difference": ours[name] - theirs[name], "ours": ours[name], "published": theirs[name]}
+        name: {"difference": mean - theirs[name], "ours": mean, "published": theirs[name]}
         for name in COMPARED
-        if name in theirs and ours[name] is not None
+        if name in theirs and (mean := ours[name]["mean"]) is not None
     }
     facts = {"config": ours["config"], "iteration": ours["iteration"], "other_options": runs[0]["added_options"]}
     photos = ", ".join(dict.fromkeys(run["photos"] or "not known" for run in runs))
     facts |= {"hardware": table["hardware"], "numbers": numbers, "photos": photos}
-    return facts | {"scene": scene, "table": table["name"]}
+    return facts | {"scene": ours["scene"], "table": table["name"]}

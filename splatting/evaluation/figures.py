@@ -46,10 +46,16 @@ def dissimilarity(row: Row, views: str) -> float | None:
     return None if ssim is None or ssim >= 1 else 1 - ssim
 
 
-def _points(rows: Sequence[Row], value: Value, views: str, subset: int | None) -> list[Point]:
-    """Seconds and values of the rows on a subset that have them; the axis of the seconds is logarithmic."""
-    pairs = ((row["seconds"], value(row, views)) for row in rows_on(rows, subset))
+def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
+    """Seconds and values of the rows that have them; the axis of the seconds is logarithmic."""
+    pairs = ((row["seconds"], value(row, views)) for row in rows)
     return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
+
+
+def _scored_at_end(rows: Sequence[Row], subset: int | None) -> list[Row]:
+    """The rows on a subset, the last one in favour of that on whole sets, which is the score."""
+    line, end = rows_on(rows, subset), whole_sets(rows[-1:])
+    return [row for row in line if row["iteration"] != end[0]["iteration"]] + end if end else line
 
 
 def _draw(axes: Axes, points: Sequence[Point], label: str | None, **style: Any) -> None:
@@ -120,7 +126,7 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
         for subset in (*sorted(subsets), None):
             for name, color in COLORS.items():
                 style = HOLLOW if subset is None and subsets else {"linewidth": 1.2}
-                points = _points(rows, value, name, subset)
+                points = _points(rows_on(rows, subset), value, name)
                 label = _views_text(subset, views[name], name) if points or subset is None else None
                 _draw(axes, points, label, **{"marker": "o", "markersize": 4, "color": color} | style)
         both = [
@@ -171,15 +177,15 @@ def draw_curves(
     """Draw a scene's test PSNR and 1 - SSIM against seconds of training; return the files, none if no run has a curve.
 
     Each option set has a colour and each seed a line, which the legend says. Lines are of the views on which all runs
-    compare; if these are a subset, hollow points beside them score all. With one option set, the training views are
-    drawn too, dashed. peers: curves of other programs, in grey.
+    compare; if these are a subset, hollow points beside them score all, and so does the end of a line. With one option
+    set, the training views are drawn too, dashed. peers: curves of other programs, in grey.
     """
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     several = len({run["config"] for run in runs}) > 1
     counts = {run["views"]["test"] for run in runs}
     subset = common_subset(run["curve"] for run in runs if not run["apart"])
     said = _views_text(subset, counts.pop() if len(counts) == 1 else None)
-    said += "" if subset is None else f"; hollow{' and other programs' if peers else ''}: all of them"
+    said += "" if subset is None else f"; hollow{', other programs' if peers else ''} and the end: all of them"
     said += "\na line for each seed" if len(runs) > len({run["config"] for run in runs}) else ""
 
     def draw(axes: Axes, value: Value) -> str:
@@ -221,19 +227,20 @@ def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several
         name += " (other ground truth)" if run["apart"] else ""
         style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
         style |= {"marker": "o", "markersize": 3.5, "alpha": 0.4 if run["apart"] else 1.0}
-        _draw(axes, _points(run["curve"], value, "test", subset), name if first else None, **style)
+        line = _scored_at_end(run["curve"], subset)
+        _draw(axes, _points(line, value, "test"), name if first else None, **style)
         if subset is not None:
-            _draw(axes, _points(run["curve"], value, "test", None), None, **style | HOLLOW)
+            _draw(axes, _points(whole_sets(run["curve"]), value, "test"), None, **style | HOLLOW)
         if not several:
             dashed = style | {"marker": "", "linestyle": "--", "alpha": 0.6}
-            of_train = _points(run["curve"], value, "train", subset)
+            of_train = _points(line, value, "train")
             if len(of_train) > 1:
                 _draw(axes, of_train, "training views" if first else None, **dashed)
 
 
 def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> None:
     """Draw other programs' curves."""
-    found = [(peer["name"], points) for peer in peers if (points := _points(peer["curve"], value, "test", None))]
+    found = [(peer["name"], points) for peer in peers if (points := _points(whole_sets(peer["curve"]), value, "test"))]
     for index, (name, points) in enumerate(found):
         _draw(
             axes, points, f"{name} (another program)", color="0.35", linestyle="--",

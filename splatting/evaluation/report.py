@@ -1,4 +1,4 @@
-"""The report: report.json of all runs, its pages report.md and report.html, the figures and timing.txt."""
+"""The report: report.json of all runs, its pages report.md and report.html, report.tex, report.csv, and figures."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from markupsafe import Markup
 from splatting.evaluation import comparison, tables
 from splatting.evaluation.figures import draw_curves, draw_poses
 from splatting.evaluation.gains import gains
+from splatting.evaluation.paper import csv_text, tex_text
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.image_files import open_image
 from splatting.files.json_files import write_json
@@ -34,6 +35,7 @@ RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
 _PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG replaces it
 _QUALITY = 90
 _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's links, emphasis, code and HTML
+_NUMBER = re.compile(r"[\d.,]*\d")
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
@@ -54,9 +56,8 @@ def make_report(
     runs = comparison.stand_apart(runs)
     scenes = list(comparison.grouped(runs, "scene"))
     rows = sorted(comparison.summarise(runs), key=lambda row: scenes.index(row["scene"]))
-    means = comparison.dataset_means(rows)
+    means = comparison.scene_means(rows)
     return {
-        "dataset_means": means,
         "gains": gains(runs),
         "manifest": {
             "command": list(command),
@@ -64,6 +65,7 @@ def make_report(
             "conventions": next((run["conventions"] for run in runs if run["conventions"]), {}),
             "resize_filter": RESIZE_FILTER,
         },
+        "means": means,
         "peers": list(peers),
         "published": comparison.compare(runs, rows, means),
         "runs": runs,
@@ -120,7 +122,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             "views": _views(output, scene, members, each),
         }
     texts = {f"report.{kind}": render(kind, report, pictures, output) for kind in ("md", "html")}
-    texts["timing.txt"] = _timing(report["runs"])
+    texts |= {"report.csv": csv_text(report), "report.tex": tex_text(report), "timing.txt": _timing(report["runs"])}
     write_json(output / "report.json", report)
     for name, text in texts.items():
         with atomic_write(output / name) as temporary:
@@ -223,15 +225,23 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "mipnerf360": any(run["group"] == "mipnerf360" for run in runs),
         "open_ended": any(row["open_ended"] for row in rows),
-        "said": [
-            (run, said) for run in runs if (said := [x for x in run["lines"] or () if not x.startswith(_WARNING)])
-        ],
+        "said": _said(runs),
         "several_seeds": known("PSNR", "std"),
         "timed": known("seconds"),
         "unfinished": [run for run in runs if not run["finished"] and not run["failure"]],
         "trainings": _trainings(runs),
         "without_lpips": bool(rows) and not known("LPIPS"),
     }
+
+
+def _said(runs: Sequence[Run]) -> list[tuple[Run, list[str]]]:
+    """What trainings said at their ends, without what all of them said; other numbers make no other sentence."""
+    lines = [
+        {_NUMBER.sub("", x.replace(run["model"], "")): x for x in run["lines"] or () if not x.startswith(_WARNING)}
+        for run in runs
+    ]
+    own = [[text for key, text in of_run.items() if not all(key in other for other in lines)] for of_run in lines]
+    return [(run, texts) for run, texts in zip(runs, own, strict=True) if texts]
 
 
 def _trainings(runs: Sequence[Run]) -> str:

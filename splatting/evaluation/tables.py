@@ -58,7 +58,7 @@ def _iteration(row: Mapping[str, Any]) -> str:
 
 
 def result_tables(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = tuple(QUANTITIES)) -> list[Table]:
-    """Tables of report.json's `summary`: rows that can be compared, and those that stand apart.
+    """Tables of report.json's `summary` and `means`: rows that can be compared, and those that stand apart.
 
     names: the QUANTITIES to show.
     """
@@ -86,20 +86,6 @@ def _results(rows: Sequence[Mapping[str, Any]], names: Sequence[str], title: str
 
 def _seeds(seeds: Sequence[int | None]) -> str:
     return " ".join("-" if seed is None else str(seed) for seed in seeds)
-
-
-def means_table(means: Sequence[Mapping[str, Any]]) -> Table:
-    """Table of report.json's `dataset_means`."""
-    columns = {
-        "data set": lambda mean: mean["group"],
-        "options": lambda mean: mean["config"] or "-",
-        "iteration": lambda mean: number(mean["iteration"], 0),
-    }
-    for name, (head, digits) in QUANTITIES.items():
-        if name in ("DISTS", "joules", *OTHER_SCORES) and not any(mean.get(name) for mean in means):
-            continue
-        columns[head] = lambda mean, name=name, digits=digits: number(mean[name], digits)
-    return table(columns, means)
 
 
 def peers_table(peers: Sequence[Mapping[str, Any]]) -> Table:
