@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -53,20 +54,23 @@ def _tex(table: Table) -> str:
     same = [column for column in columns if column[0] in _CONSTANT and len(set(column[1:])) == 1]
     header, *rows = zip(*(column for column in columns if column not in same), strict=True)
     said = "".join(f", {name} {value}" for name, value, *_ in same)
-    apart = f" {table.title}" if table.title else ""
-    spread = " Means $\\pm$ sample standard deviations over the seeds." if any("±" in str(row) for row in rows) else ""
-    body, scene = [], None
-    for row in rows:
-        body += [] if scene in (None, row[0]) else ["\\midrule"]
-        body.append(_line(["" if row[0] == scene else row[0], *row[1:]]))
-        scene = row[0]
-    texts = "l" * (1 + ("options" in header))
+    caption = f"Scores of the test views{said}."
+    if any("±" in str(row) for row in rows):
+        caption += " Means ± sample standard deviations over the seeds."
+    lines = [_line(row) for row in rows]
+    if "options" in header:  # which stand below their scene
+        lines, header = [], header[1:]
+        for scene, of_scene in itertools.groupby(rows, key=lambda row: row[0]):
+            lines += ["\\midrule"] if lines else []
+            lines += [f"\\multicolumn{{{len(header)}}}{{l}}{{{_escaped(scene)}}} \\\\"]
+            lines += [_line(row[1:]) for row in of_scene]
     return "\n".join([
-        "\\begin{table}", "\\centering\\footnotesize\\setlength{\\tabcolsep}{3pt}",
+        "\\begin{table}", "\\footnotesize\\setlength{\\tabcolsep}{3pt}",
         *(f"\\providecommand{{\\{rule}}}{{\\hline}}" for rule in _RULES),
-        f"\\caption{{Scores of the test views{_escaped(said)}.{spread}{_escaped(apart)}}}",
-        f"\\begin{{tabular}}{{{texts}{'r' * (len(header) - len(texts))}}}",
-        "\\toprule", _line(header), "\\midrule", *body, "\\bottomrule", "\\end{tabular}", "\\end{table}", "",
+        f"\\caption{{{_escaped(f'{caption} {table.title}')}}}\\medskip",
+        # A wide one stands in both margins.
+        f"\\makebox[\\linewidth]{{\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}",
+        "\\toprule", _line(header), "\\midrule", *lines, "\\bottomrule", "\\end{tabular}}", "\\end{table}", "",
     ])  # fmt: skip
 
 
