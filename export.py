@@ -1,6 +1,6 @@
 """Write a trained model in the file format of another program.
 
-python export.py -m MODEL --to FILE [--iteration N] [--sh_degree D] [--crop X0 Y0 Z0 X1 Y1 Z1] [--max_splats N]
+python export.py -m MODEL --to FILE [--to FILE ...] [--iteration N] [--sh_degree D] [--max_splats N]
 python export.py MODEL_OF_ANY_TOOL --to FILE
 
 The ending of FILE names the format; splatting/exports/formats.py has the table.
@@ -12,8 +12,8 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
+import functools
 import math
-import os
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -34,8 +34,8 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
-from scene.with_splats import load_file, place, splats_of
-from splatting.camera_paths.without_scene import RECORD, circle, recorded_cameras, warn_if_moved
+from scene.with_splats import load_file, model_of, place, splats_of
+from splatting.camera_paths.without_scene import WithoutScene, circle, record_of, recorded_cameras, warn_if_moved
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_comparison
 from splatting.exports.formats import FORMATS, Around, Format, format_of
@@ -54,28 +54,36 @@ if TYPE_CHECKING:  # SciPy takes a while to import
 FOR_PHONES = 500_000  # Gaussians of a page
 
 
-def load(args: argparse.Namespace, options: argparse.Namespace, needs_views: bool) -> tuple[Splats, Scene | None]:
-    """The splats that the command line names, and the scene if views are wanted.
+def load(
+    args: argparse.Namespace, options: argparse.Namespace, needs_views: bool, needs_photos: bool
+) -> tuple[Splats, Scene | WithoutScene | None]:
+    """The splats that the command line names, and the scene if views are wanted, also without photos where it is gone.
 
-    options: the model options. UserError if there is nothing to load, or views are wanted of a model without a scene.
+    options: the model options. UserError if there is nothing to load, or what is needed is not there.
     """
-    if needs_views:
-        if not args.model_path:
-            raise UserError(
-                "--max_splats, --clean and meshes need training views; give their model folder with -m, and beside it "
-                f"--ply {args.ply}"
-            )
+    if needs_views and not args.model_path:
+        raise UserError(
+            "--max_splats, --clean, --walk and meshes need training views; give their model folder with -m, and beside "
+            f"it --ply {args.ply}"
+        )
+    record = record_of(options) if needs_views and not needs_photos else None
+    if needs_views and record is None:
         options.images_to_load = 1  # each image is used once or twice
         smooth = argparse.Namespace(antialiasing=bool(args.antialiasing))
         scene = load_file(options, args.ply, smooth) if args.ply else load_saved(options, args.iteration)
         return splats_of(scene.gaussians, smooth.antialiasing), scene
     if args.ply:
         splats = read_any(args.ply)
-        return replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing)), None
-    _, path = find_save(options.model_path, args.iteration)
-    gaussians = read_model(path)
-    place(gaussians, options.model_path)
-    return splats_of(gaussians, bool(args.antialiasing)), None
+        splats = replace(splats, antialiasing=splats.antialiasing or bool(args.antialiasing))
+    else:
+        _, path = find_save(options.model_path, args.iteration)
+        gaussians = read_model(path)
+        place(gaussians, options.model_path)
+        splats = splats_of(gaussians, bool(args.antialiasing))
+    if record is None:
+        return splats, None
+    cameras = recorded_cameras(record, options.resolution)
+    return splats, WithoutScene(model_of(splats), options.model_path, args.iteration, cameras)
 
 
 @torch.no_grad()
@@ -86,11 +94,11 @@ def thin_out(
     count: int,
     pipe: argparse.Namespace,
     options: argparse.Namespace,
-    scored: bool,
+    unscored: str,
 ) -> np.ndarray:
     """Indices of the `count` Gaussians of the mask `keep` that the training views need most, the most needed first.
 
-    Print the loss, if any go. scored: photos show all of it.
+    Print the loss, if any go. unscored: why that is not known, empty: it is.
     """
     every, cameras = scene.gaussians, scene.getTrainCameras()
     kept = np.flatnonzero(keep)
@@ -99,8 +107,8 @@ def thin_out(
     views = ScoredViews(pipe, background, scene.halves)
     chosen = most_needed(before, cameras, views, count)
     if len(chosen) < len(kept):
-        loss = "no score, as photos show more than the crop"
-        if scored:
+        loss = f"no score, as {unscored}"
+        if not unscored:
             change = change_on_views(before, before.part(chosen, sh_degree), cameras, views, scored=True)
             one, other = change["psnr_before"], change["psnr_after"]
             loss = f"training views {one:.2f} -> {other:.2f} dB ({other - one:+.2f} dB)"
@@ -117,13 +125,14 @@ def sky_of(model: str | None, means: np.ndarray) -> np.ndarray:
     return found[0].numpy()
 
 
-def cleaned(scene: Scene, most: float, pipe: argparse.Namespace, options: argparse.Namespace, to: str) -> np.ndarray:
+def cleaned(
+    scene: Scene, most: float, pipe: argparse.Namespace, options: argparse.Namespace, picture: Path
+) -> np.ndarray:
     """(N,) bool: what the training views need, to within `most` dB each; print what goes, and write a picture of it."""
     cleaning, views = clean_scene(scene, most, pipe, options.white_background)
     if not cleaning.keep.all():
-        picture = _picture_of_removed(to)
         write_comparison(picture, scene.gaussians, cleaning.keep, scene.getTrainCameras(), views)
-        print(f"{picture}: before, what goes, and after")
+        print(f"{picture}: before, gone, after")
     return cleaning.keep.cpu().numpy()
 
 
@@ -131,65 +140,94 @@ def _picture_of_removed(to: str) -> Path:
     return Path(to).with_name(f"{Path(to).name}.removed.png")
 
 
-def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace, entry: Format) -> None:
-    """Write the file that the command line asks for. UserError if there is nothing to load or to write."""
-    _check_fitting(args, entry)
-    make_path = _path_maker(args.path)
-    entry.check(args.to)
-    _refuse_to_replace_a_model(Path(args.to), args.ply)
-    check_upright(args)
-    if entry.clean and not (args.raw or args.clean) and stand_ins(args, options) is None:
-        args.clean = CLEAN_OPTION["const"]
-    if args.clean:
-        refuse_foreign(_picture_of_removed(args.to))
-    needs_scene = bool(args.max_splats or args.clean or args.walk)
-    poses = stand_ins(args, options) if entry.around and not needs_scene else None
-    if poses and entry.clean and args.model_path and not args.raw:
-        print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
-    needs_views = needs_scene or entry.of_scene and not poses or oriented_later(args)
-    splats, scene = load(args, options, needs_views)
-    if scene:
-        _check_views(args, make_path, scene.getTrainCameras())
+def _cleaned_targets(args: argparse.Namespace) -> list[str]:
+    """The files that hold what --clean leaves, where there are photos."""
+    by_itself = bool(args.model_path) and not args.raw
+    return [to for to in args.to if args.clean or (format_of(to).clean and by_itself)]
+
+
+def chooser(
+    args: argparse.Namespace,
+    options: argparse.Namespace,
+    pipe: argparse.Namespace,
+    splats: Splats,
+    scene: Scene | WithoutScene | None,
+) -> Callable[[str], Splats]:
+    """What gives the splats of a file of --to. What several of them need is found once."""
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     if args.no_sky:
         keep &= ~sky_of(args.model_path, splats.means)
-    if args.clean:
-        keep &= cleaned(scene, args.clean, pipe, options, args.to)
-    if args.max_splats and (entry.in_order or keep.sum() > args.max_splats):
-        keep = thin_out(scene, keep, degree, args.max_splats, pipe, options, scored=args.crop is None)
-    chosen = tidy(with_sh_degree(selected(splats, keep), degree))
+    of_cleaned = _cleaned_targets(args) if isinstance(scene, Scene) else []
+    unscored = "" if isinstance(scene, Scene) else "the photos are gone"
+    unscored = "photos show more than the crop" if args.crop else unscored
+
+    @functools.cache
+    def needed(clean: bool) -> np.ndarray:
+        most = args.clean or CLEAN_OPTION["const"]
+        return keep & cleaned(scene, most, pipe, options, _picture_of_removed(of_cleaned[0])) if clean else keep
+
+    @functools.cache
+    def chosen(clean: bool, thin: bool) -> Splats:
+        rows = needed(clean)
+        rows = thin_out(scene, rows, degree, args.max_splats, pipe, options, unscored) if thin else rows
+        return tidy(with_sh_degree(selected(splats, rows), degree))
+
+    def splats_for(to: str) -> Splats:
+        clean, in_order = to in of_cleaned, format_of(to).in_order
+        return chosen(clean, bool(args.max_splats and (in_order or needed(clean).sum() > args.max_splats)))
+
+    return splats_for
+
+
+def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace) -> None:
+    """Write the files that the command line asks for. UserError if there is nothing to load or to write."""
+    entries = [format_of(to) for to in args.to]
+    _check_fitting(args, entries)
+    make_path = _path_maker(args.path)
+    for to, entry in zip(args.to, entries, strict=True):
+        entry.check(to)
+        _refuse_to_replace_a_model(Path(to), args.ply)
+    check_upright(args)
+    for to in _cleaned_targets(args)[:1]:
+        refuse_foreign(_picture_of_removed(to))
+    needs_views = bool(args.max_splats or args.clean or args.walk) or oriented_later(args)
+    needs_views |= any(entry.of_scene and (args.model_path or not entry.around) for entry in entries)
+    splats, scene = load(args, options, needs_views, needs_photos=bool(args.clean))
+    if isinstance(scene, WithoutScene) and _cleaned_targets(args):
+        print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
+    if scene:
+        _check_views(args, make_path, scene.getTrainCameras())
+    splats_for = chooser(args, options, pipe, splats, scene)
     if getattr(pipe, "projection", "ewa") == "ray":
         print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
-    start = time.perf_counter()
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
-    cameras = poses(chosen) if poses else scene and scene.getTrainCameras()
-    around = entry.of_scene and Around(
-        cameras, background, pipe, make_path, args.voxel, args.start, args.title, args.notes, args.walk
-    )
-    chosen, around = placed(args, entry.of_scene, chosen, around)
-    what = entry.write(args.to, chosen, *((around,) if around else ()))
-    size, seconds = Path(args.to).stat().st_size, time.perf_counter() - start
-    if what is None:
-        kept = degree if entry.bands else 0
-        spare = args.typed_sh_degree is None and entry.bands and degree < splats.sh_degree
-        unused = " (higher bands are zero)" if spare else ""
-        each = f" ({size / max(len(chosen), 1):.0f} bytes each)"
-        what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {kept}{unused}"
-    else:
-        each = ""
-    print(f"Wrote {args.to}: {what}, {size / 1e6:.2f} MB{each}, {seconds:.1f} s")
-    if entry.clean and len(chosen) > FOR_PHONES:
-        print(f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; --max_splats {FOR_PHONES} makes a page for them")
+    for to, entry in zip(args.to, entries, strict=True):
+        chosen = splats_for(to)
+        start = time.perf_counter()
+        around = None
+        if entry.of_scene:
+            cameras = scene.getTrainCameras() if scene else circle(chosen.means)
+            texts = args.start, args.title, args.notes
+            around = Around(cameras, background, pipe, make_path, args.voxel, *texts, args.walk)
+        chosen, around = placed(args, entry.of_scene, chosen, around)
+        what = entry.write(to, chosen, *((around,) if around else ()))
+        print(f"Wrote {to}: {_told(to, entry, what, chosen, splats, args)}, {time.perf_counter() - start:.1f} s")
+        if "walk" in entry.options and len(chosen) > FOR_PHONES:
+            print(
+                f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; --max_splats {FOR_PHONES} makes a page for them"
+            )
 
 
-def stand_ins(args: argparse.Namespace, options: argparse.Namespace) -> Callable[[Splats], list[Camera]] | None:
-    """What makes cameras for a model without a scene, or whose scene is gone; None: the scene has them."""
-    if not args.model_path:
-        return lambda splats: circle(splats.means)
-    if os.path.isdir(options.source_path or "") or not (record := Path(args.model_path) / RECORD).is_file():
-        return None
-    return lambda _: recorded_cameras(record)
+def _told(to: str, entry: Format, what: str | None, chosen: Splats, splats: Splats, args: argparse.Namespace) -> str:
+    """What a file is, and its size. what: as its writer says, None: splats."""
+    size = Path(to).stat().st_size
+    if what is not None:
+        return f"{what}, {size / 1e6:.2f} MB"
+    spare = args.typed_sh_degree is None and entry.bands and chosen.sh_degree < splats.sh_degree
+    degree = chosen.sh_degree if entry.bands else 0
+    what = f"{len(chosen):,} of {len(splats):,} Gaussians, SH degree {degree}{' (higher bands are zero)' * spare}"
+    return f"{what}, {size / 1e6:.2f} MB ({size / max(len(chosen), 1):.0f} bytes each)"
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
@@ -201,10 +239,12 @@ def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
         raise UserError(f"--to {file} would overwrite a trained model or its input; choose another file")
 
 
-def _check_fitting(args: argparse.Namespace, entry: Format) -> None:
-    """UserError for an option that is for files of another kind."""
+def _check_fitting(args: argparse.Namespace, entries: Sequence[Format]) -> None:
+    """UserError for an option that is for files of other kinds, and for a file that is named twice."""
+    if twice := [to for place, to in enumerate(args.to) if to in args.to[:place]]:
+        raise UserError(f"--to {twice[0]} is given twice; give each file once")
     for option in ("path", "voxel", "start", "title", "notes", "walk", "raw"):
-        if getattr(args, option) and option not in entry.options:
+        if getattr(args, option) and not any(option in entry.options for entry in entries):
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
 
@@ -244,7 +284,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     pipeline_params = PipelineParams(parser, sentinel=True)
     add = parser.add_argument
     endings = "; ".join(f"{entry.ending}: {entry.what}" for entry in FORMATS)
-    add("--to", required=True, metavar="FILE", help=f"file to write; its ending is the format. {endings}")
+    add("--to", required=True, action="append", metavar="FILE",
+        help=f"file to write; its ending is the format. May be given again, for several files. {endings}")  # fmt: skip
     add("file", nargs="?", default="", metavar="MODEL", help=f"write this model, of any tool, without a scene: {ANY}")
     add("--iteration", type=int, default=-1, help="saved iteration to write (default: -1, the last)")
     add(
@@ -306,7 +347,7 @@ def main() -> None:
     parser, model_params, pipeline_params = options()
     args = parse(parser)
     safe_state(args.quiet)
-    export(args, model_params.extract(args), pipeline_params.extract(args), format_of(args.to))
+    export(args, model_params.extract(args), pipeline_params.extract(args))
 
 
 if __name__ == "__main__":

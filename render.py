@@ -22,8 +22,9 @@ import argparse
 import copy
 import shutil
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
@@ -48,6 +49,9 @@ from splatting.files.json_files import write_json
 from splatting.host.progress import Bar
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p, run_cli
+
+if TYPE_CHECKING:
+    from splatting.camera_paths.without_scene import WithoutScene
 
 
 def write_views(
@@ -185,12 +189,20 @@ def render_sets(
 
 
 def _loaded(
-    dataset: argparse.Namespace, iteration: int, sh_degree: int | None, ply: str, pipeline: argparse.Namespace
-) -> tuple[Scene, torch.Tensor]:
-    """The scene with the model of a saved iteration, or that of the file `ply`, and the background (3,)."""
+    dataset: argparse.Namespace,
+    iteration: int,
+    sh_degree: int | None,
+    ply: str,
+    pipeline: argparse.Namespace,
+    load: Callable[..., Scene | WithoutScene] = load_saved,
+) -> tuple[Scene | WithoutScene, torch.Tensor]:
+    """The scene with the model of a saved iteration, or that of the file `ply`, and the background (3,).
+
+    load: loads a saved iteration; `saved_scene` also without the scene.
+    """
     options = copy.copy(dataset)
     options.images_to_load = 1  # each photo is used once
-    scene = load_file(options, ply, pipeline) if ply else load_saved(options, iteration, sh_degree)
+    scene = load_file(options, ply, pipeline) if ply else load(options, iteration, sh_degree)
     if not ply and getattr(dataset, "other_scene", ""):
         scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
     scene.loaded_iter = f"{scene.loaded_iter}{dataset.marks}" if getattr(dataset, "marks", "") else scene.loaded_iter
@@ -234,7 +246,9 @@ def main() -> None:
     warn_of_background(options)
     request = path_request(args)
     if request:
-        scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline)
+        from splatting.camera_paths.without_scene import saved_scene  # as above
+
+        scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
         render_path(scene, pipeline, background, request)
         return
     chosen = {

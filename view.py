@@ -14,18 +14,15 @@ import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 import argparse
 import os
-import sys
-from pathlib import Path
 
 from torch import Tensor
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
 from scene.gaussians.morton import sort_scattered
-from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.splats import drawable, selected
 from scene.with_splats import model_of
-from splatting.camera_paths.without_scene import RECORD, WithoutScene, circle, recorded_cameras, warn_if_moved
+from splatting.camera_paths.without_scene import WithoutScene, circle, saved_scene, warn_if_moved
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene
 from splatting.exports.reading import ANY, read_any
@@ -49,14 +46,9 @@ def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
 
 def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
     """The model of a folder with its scene, or where that is gone with the poses that the folder records."""
-    record = Path(options.model_path) / RECORD
-    if os.path.isdir(options.source_path or "") or not record.is_file():
-        scene = load_saved(options, args.iteration, args.typed_sh_degree)
-        warn_if_moved(options.model_path, scene.getTrainCameras())
-        return scene
-    iteration, path = find_save(options.model_path, args.iteration)
-    print(f"warning: the scene {options.source_path} is gone, so there are poses, but no photos", file=sys.stderr)
-    return WithoutScene(read_model(path), options.model_path, iteration, recorded_cameras(record))
+    scene = saved_scene(options, args.iteration, args.typed_sh_degree)
+    warn_if_moved(options.model_path, scene.getTrainCameras())
+    return scene
 
 
 def kept(

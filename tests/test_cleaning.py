@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from gaussians import pipeline
-from PIL import Image
 
 import export
 import train
@@ -16,6 +15,8 @@ from scene.splats.reading import read_splats
 from scene.with_splats import model_of, splats_of
 from splatting.camera_paths.poses import poses_of
 from splatting.demo.make_scene import make_scene
+from splatting.evaluation.renders import sheet
+from splatting.exports import cleaning
 from splatting.exports.cleaning import Cleaning, clean
 from utils.system_utils import UserError
 
@@ -74,18 +75,27 @@ def test_no_view_loses_more_than_allowed(cleaned, trained, views):
 def test_export_says_and_draws_what_goes(cleaned, trained, tmp_path, monkeypatch, capsys):
     model, scene = trained
     gone = int((~cleaned[0].keep).sum())
+    drawn = []
+    monkeypatch.setattr(cleaning, "sheet", lambda *content: drawn.append(content) or sheet(*content))
     words = ["export.py", "-m", str(model), "--to", str(tmp_path / "a.ply"), "--clean"]
-    monkeypatch.setattr("sys.argv", words)
+    monkeypatch.setattr("sys.argv", [*words, "--to", str(tmp_path / "b.spz"), "--to", str(tmp_path / "c.html")])
     export.main()
     said = capsys.readouterr().out
     assert f"--clean 0.05: {gone:,} of {len(scene.gaussians):,} Gaussians go" in said and " most, by -0.0" in said
     assert len(read_splats(tmp_path / "a.ply")) == len(scene.gaussians) - gone
-    assert np.asarray(Image.open(tmp_path / "a.ply.removed.png")).shape == (3 * 60, 3 * 80, 3)
+    ((titles, rows, _),) = drawn  # once for all files
+    assert titles == ("before", "gone", "after") and len(rows) == 3
+    assert {name for row in rows for name, _ in row} <= {"", *(camera.image_name for camera in scene.getTrainCameras())}
+    before, left_out, after = (np.asarray(image, np.float64) for _, image in rows[0])
+    assert before.shape == (60, 80, 3) and left_out.mean() < after.mean() < 1.1 * before.mean()
+    assert len(read_splats(tmp_path / "b.spz")) == len(scene.gaussians) - gone
+    pictures = sorted(path.name for path in tmp_path.glob("*.removed.png"))
+    assert pictures == ["a.ply.removed.png"] and (tmp_path / "c.html").is_file()
     monkeypatch.setattr("sys.argv", [*words, "0"])
     with pytest.raises(UserError, match="--clean must be above 0 dB, got 0.0"):
         export.main()
     monkeypatch.setattr("sys.argv", ["export.py", "--ply", str(tmp_path / "a.ply"), "--to", "b.ply", "--clean"])
-    with pytest.raises(UserError, match="--clean and meshes need training views"):
+    with pytest.raises(UserError, match="--clean, --walk and meshes need training views"):
         export.main()
 
 

@@ -78,7 +78,7 @@ def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):
 def _export_options(*argv: object) -> tuple:
     parser, model_params, pipeline_params = export.options()
     args = export.parse(parser, [str(word) for word in argv])
-    return args, model_params.extract(args), pipeline_params.extract(args), format_of(args.to)
+    return args, model_params.extract(args), pipeline_params.extract(args)
 
 
 def _train(scene: Path, out: Path, *argv: object) -> GaussianModel:
@@ -264,11 +264,15 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         ("--ply a.ply --to b.splat --path ellipse", "--path is for .html; leave it out, or end --to with .html"),
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
         ("--ply a.ply --to b.html", "no file a.ply"),
+        ("--ply a.ply --to b.spz --to c.ply --to b.spz", "--to b.spz is given twice; give each file once"),
+        ("--ply a.ply --to b.spz --to c.plx", "the format of c.plx is unknown"),
+        ("--ply a.ply --to b.html --to mesh.ply", "meshes need training views"),
     ],
 )
 def test_export_refuses(words, said):
+    to = () if "--to" in words else ("--to", "b.ply")
     with pytest.raises(UserError, match=said):
-        export.export(*_export_options("--to", "b.ply", *words.split()))
+        export.export(*_export_options(*to, *words.split()))
 
 
 def test_a_page_plays_the_camera_path(tmp_path, colmap_scene):

@@ -91,8 +91,8 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
     model = tmp_path / "model"
     train.main(["-s", str(colmap_scene), "-m", str(model), "--iterations", "2", "--disable_viewer", "--quiet"])
 
-    def run(*words: str) -> None:
-        monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / "page.html"), *words])
+    def run(*words: str, to: str = "page.html") -> None:
+        monkeypatch.setattr("sys.argv", ["export.py", "-m", str(model), "--to", str(tmp_path / to), *words])
         export.main()
 
     for picture in ("page.html.jpg", "page.html.removed.png"):
@@ -109,10 +109,11 @@ def test_pages_are_cleaned_unless_they_are_raw(colmap_scene, tmp_path, monkeypat
         ("--start nowhere", "--start nowhere is no training photo"),  # before the views are rendered
         ("--path spiral", "--path"),
         ("--raw --clean", "contradict"),
-        ("--to a.ply --title Room", r"--title is for \.html"),
     ):
         with pytest.raises(UserError, match=said):
             run(*words.split())
+    with pytest.raises(UserError, match=r"--title is for \.html"):
+        run("--title", "Room", to="a.ply")
     capsys.readouterr()
     run("--raw", "--title", "Room")
     assert "warning" not in capsys.readouterr().err

@@ -14,6 +14,8 @@ import pytest
 from gaussians import model
 from PIL import Image
 
+from scene.cameras import camera_to_JSON
+from scene.dataset_readers import read_scene
 from splatting.camera_paths import render_path
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
 from splatting.camera_paths.video import write_video
@@ -102,6 +104,26 @@ def test_each_generated_path_has_its_name_size_and_length(run, name, size, count
     assert np.std(frames[0]) > 5 and written(folder) == [f"{name}.mp4"]  # something is seen
     for odd, even in (((97, 64), (96, 64)), ((96, 65), (96, 64)), ((1, 1), (2, 2))):
         assert render_path.even_size(SimpleNamespace(image_width=odd[0], image_height=odd[1])) == even
+
+
+def test_a_video_needs_no_photos(run, out, tmp_path, capsys, _colmap_master):
+    """Where the scene is gone, the cameras that the model folder records make the same video; views are refused."""
+    PATH.write(tmp_path / "tour.json")
+    options = (out / "cfg_args").read_text().replace("eval=True", "eval=False, resolution=2")
+    infos = read_scene(str(_colmap_master), "images", False).train_cameras
+    (out / "cameras.json").write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(infos)]))
+    for path, seconds in (("interpolate", ["--seconds", 1]), ("ellipse", ["--seconds", 1]), ("tour.json", [])):
+        found = []
+        for source in (str(_colmap_master), f"{tmp_path}/gone"):
+            (out / "cfg_args").write_text(options.replace(str(_colmap_master), source))
+            path = path if seconds else tmp_path / path
+            found.append(decoded(run("--path", path, "--fps", 4, *seconds) / f"{Path(path).stem}.mp4"))
+        (known, frames), (again, of_gone) = found
+        assert known["size"] == again["size"] == (48, 32) and len(frames) == len(of_gone) >= 4
+        assert max(np.abs(one.astype(int) - other).mean() for one, other in zip(of_gone, frames, strict=True)) < 1
+        assert capsys.readouterr().err.count("gone is gone, so there are poses, but no photos") == 1
+    with pytest.raises(UserError, match="no scene folder .*gone; name an existing one with -s"):
+        run()
 
 
 def test_the_background_is_the_models_and_exposures_are_not_applied(run, out, tmp_path, _colmap_master):

@@ -14,9 +14,11 @@ from small_splats import written
 import export
 import view
 from gaussian_renderer import render
+from scene.saved_model import read_model
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
 from splatting.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
+from splatting.exports.formats import FORMATS
 from splatting.exports.reading import read_any
 from splatting.viewer.views import SceneCameras
 from utils.camera_utils import camera_to_JSON
@@ -81,28 +83,50 @@ def test_poses_that_moved_since_the_training_are_told(tmp_path):
     assert not have_moved(tmp_path, cameras)
 
 
-def test_a_folder_whose_scene_is_gone_keeps_its_poses(tmp_path, capsys):
+@pytest.fixture
+def gone(tmp_path) -> Path:
+    """A model folder of the balls, of a scene that is gone, which had the cameras of the circle."""
+    splats = balls()
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
-    written(tmp_path, ".ply", balls()).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
-    (tmp_path / "cameras.json").write_text(json.dumps([]))
-    options = argparse.Namespace(model_path=str(tmp_path), source_path=str(tmp_path / "gone"))
+    written(tmp_path, ".ply", splats).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
+    (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=1, source_path='{tmp_path}/gone', white_background=False)")
+    cameras = circle(splats.means)
+    for camera in cameras:
+        camera.width, camera.height = camera.image_width, camera.image_height
+    (tmp_path / "cameras.json").write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(cameras)]))
+    return tmp_path
+
+
+def test_a_folder_whose_scene_is_gone_keeps_its_poses(gone, capsys):
+    options = argparse.Namespace(model_path=str(gone), source_path=str(gone / "gone"), resolution=4)
     scene = view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
     assert scene.loaded_iter == 7 and len(scene.gaussians) == len(balls())
+    assert {(camera.image_width, camera.image_height) for camera in scene.getTrainCameras()} == {(240, 180)}
     assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
     with pytest.raises(UserError, match="gone, which is gone; leave it out"):
         view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
-def test_a_page_of_a_folder_whose_scene_is_gone_has_its_poses(tmp_path, monkeypatch, capsys):
-    (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
-    written(tmp_path, ".ply", balls()).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
-    (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=1, source_path='{tmp_path}/gone', white_background=False)")
-    entry = {"img_name": "IMG_7", "width": 64, "height": 48, "position": [0.0, 0, -4], "fx": 60.0, "fy": 60.0}
-    (tmp_path / "cameras.json").write_text(json.dumps([entry | {"rotation": np.eye(3).tolist()}]))
-    monkeypatch.setattr("sys.argv", ["export.py", "-m", str(tmp_path), "--to", str(tmp_path / "page.html")])
+def test_every_format_of_a_folder_whose_scene_is_gone(gone, monkeypatch, capsys):
+    """In one call, which reads the model once. Those that a program of others writes are not tried."""
+    reads, endings = [], [entry.ending for entry in FORMATS if entry.ending not in (".sog", "lod-meta.json")]
+    monkeypatch.setattr(export, "read_model", lambda path: reads.append(path) or read_model(path))
+    files = [gone / f"{number}{ending}" for number, ending in enumerate(endings)]
+    words = [word for file in files for word in ("--to", str(file))]
+    shared = ["export.py", "-m", str(gone), "-r", "8", "--max_splats", "400", "--voxel", "0.1", "--start", "around 3"]
+    monkeypatch.setattr("sys.argv", [*shared, *words])
     export.main()
-    assert "IMG_7" in (tmp_path / "page.html").read_text(encoding="utf-8")
-    assert f"not cleaned, as there is no scene folder {tmp_path}/gone; name it with -s" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert len(reads) == 1 and said.out.count("600 -> 400 Gaussians: no score, as the photos are gone;") == 1
+    assert said.err.count("gone is gone, so there are poses, but no photos") == 1
+    assert f"not cleaned, as there is no scene folder {gone}/gone; name it with -s" in said.err
+    for file in files:
+        assert file.stat().st_size and f"Wrote {file}: " in said.out
+    assert len(read_splats(gone / "3.ply")) == 400 and "View 10 of 10" in files[-1].read_text(encoding="utf-8")
+    for need in ("--clean", "--upright"):
+        monkeypatch.setattr("sys.argv", ["export.py", "-m", str(gone), "--to", str(gone / "a.ply"), need])
+        with pytest.raises(UserError, match="no scene folder .*gone; name|--upright needs a model folder"):
+            export.main()
 
 
 def test_export_takes_a_file_alone(tmp_path, monkeypatch):
@@ -115,10 +139,10 @@ def test_export_takes_a_file_alone(tmp_path, monkeypatch):
     run(str(path), "--to", str(tmp_path / "out.ply"))
     np.testing.assert_array_equal(read_splats(tmp_path / "out.ply").means, read_splats(path).means)
     run(str(path), "--to", str(tmp_path / "page.html"), "--path", "ellipse")
-    assert "around 11" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "View 10 of 10" in (tmp_path / "page.html").read_text(encoding="utf-8")
     for words, said in (
-        (["--max_splats", "10", "--to", "a.ply"], "--max_splats, --clean and meshes need training views"),
-        (["--to", "mesh.ply"], "--max_splats, --clean and meshes need training views"),
+        (["--max_splats", "10", "--to", "a.ply"], "--max_splats, --clean, --walk and meshes need training views"),
+        (["--to", "mesh.ply"], "--max_splats, --clean, --walk and meshes need training views"),
         (["-m", str(tmp_path), "--to", "a.ply"], "stands alone; beside -m or --ply, give one file by --ply"),
     ):
         with pytest.raises(UserError, match=said):

@@ -24,6 +24,7 @@ from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     from splatting.camera_paths.poses import Poses
+    from splatting.camera_paths.without_scene import WithoutScene
 
 FPS = 30
 MOST_FPS = 240
@@ -118,7 +119,9 @@ def path_maker(path: str, seconds: float | None = None) -> Callable[["Poses"], T
 
 
 @torch.no_grad()
-def render_path(scene: Scene, pipe: argparse.Namespace, background: torch.Tensor, request: PathRequest) -> Path:
+def render_path(
+    scene: "Scene | WithoutScene", pipe: argparse.Namespace, background: torch.Tensor, request: PathRequest
+) -> Path:
     """Write the video of a path, and its frames if they are asked for; return the video's path.
 
     scene: with a loaded model. pipe, background: as for `render`. Files: MODEL/videos/ours_N/NAME.mp4 and

@@ -3,6 +3,7 @@
 And whether a scene that is at hand still has those cameras.
 """
 
+import argparse
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,12 @@ import numpy as np
 
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.morton import sort_scattered
+from scene.images.sizes import training_size
 from scene.readers.info import CameraInfo
+from scene.saved_model import find_save, load_saved, read_model
+from scene.scene import Scene
+from scene.with_splats import place
 from splatting.camera_paths.poses import facing, poses_of
 from splatting.files.json_files import read_json
 from utils.system_utils import UserError
@@ -30,7 +36,7 @@ _MOVED = 1e-3  # of the mean distance of cameras from their middle; other progra
 
 @dataclass
 class WithoutScene:
-    """What a viewer takes of a scene, with cameras that have no photos. loaded_iter: the iteration, or a name."""
+    """What needs no photos takes of a scene: cameras that have none. loaded_iter: the iteration, or a name."""
 
     gaussians: GaussianModel
     model_path: str
@@ -46,6 +52,29 @@ class WithoutScene:
         return list(self.test)
 
 
+def record_of(options: argparse.Namespace) -> Path | None:
+    """The cameras.json of a model folder whose scene is gone; None: the scene is there, or nothing stands in for it.
+
+    options: the model options.
+    """
+    record = Path(options.model_path) / RECORD
+    if os.path.isdir(options.source_path or "") or not record.is_file():
+        return None
+    print(f"warning: the scene {options.source_path} is gone, so there are poses, but no photos", file=sys.stderr)
+    return record
+
+
+def saved_scene(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene | WithoutScene:
+    """The model of a folder with its scene, as `load_saved`, or where that is gone with the cameras of `record_of`."""
+    if (record := record_of(options)) is None:
+        return load_saved(options, iteration, sh_degree)
+    iteration, path = find_save(options.model_path, iteration)
+    gaussians = read_model(path, sh_degree)
+    place(gaussians, options.model_path)
+    sort_scattered(gaussians)
+    return WithoutScene(gaussians, options.model_path, iteration, recorded_cameras(record, options.resolution))
+
+
 def circle(means: np.ndarray) -> list[Camera]:
     """Views that look from a circle at the middle of positions (N, 3): their median. Up is -y, as of most models."""
     middle = np.median(means, axis=0).astype(np.float64) if len(means) else np.zeros(3)
@@ -58,10 +87,13 @@ def circle(means: np.ndarray) -> list[Camera]:
     return _cameras(infos)
 
 
-def recorded_cameras(path: Path) -> list[Camera]:
-    """The cameras of a model folder's cameras.json. UserError if there is none, or it is damaged."""
+def recorded_cameras(path: Path, resolution: int = 1) -> list[Camera]:
+    """The cameras of a model folder's cameras.json, at the size that option -r makes of their photos.
+
+    UserError if there is none, or it is damaged.
+    """
     try:
-        return _cameras([_recorded(number, entry) for number, entry in enumerate(read_json(path))])
+        return _cameras([_recorded(number, entry) for number, entry in enumerate(read_json(path))], resolution)
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} has no cameras that can be read ({error}); give the scene with -s") from error
 
@@ -108,5 +140,6 @@ def _info(
     return CameraInfo(number, turn, -turn.T @ place, fx=fx, fy=fy or fx, **options)
 
 
-def _cameras(infos: Sequence[CameraInfo]) -> list[Camera]:
-    return [Camera(info, (info.width, info.height), number) for number, info in enumerate(infos)]
+def _cameras(infos: Sequence[CameraInfo], resolution: int = 1) -> list[Camera]:
+    sizes = (training_size(info.width, info.height, resolution) for info in infos)
+    return [Camera(info, size, number) for number, (info, size) in enumerate(zip(infos, sizes, strict=True))]

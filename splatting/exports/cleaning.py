@@ -25,6 +25,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
 from splatting.camera_paths.without_scene import WithoutScene
+from splatting.evaluation.renders import WIDEST, sheet
 from splatting.files.image_files import to_bytes
 from splatting.files.ours import write_picture
 from splatting.host.progress import Bar
@@ -159,12 +160,14 @@ def clean_scene(
 def write_comparison(
     path: str | os.PathLike, gaussians: GaussianModel, keep: Tensor, cameras: Sequence[Camera], views: ScoredViews
 ) -> None:
-    """Write a PNG of the views that change most: before, what goes, and after, side by side, a row for each view."""
+    """Write a PNG of the views that change most, a row for each view: before, gone, after."""
     degree = gaussians.max_sh_degree
     gone, after = gaussians.part(~keep, degree), gaussians.part(keep, degree)
     changes = [float((views.image(c, gaussians) - views.image(c, after)).square().mean()) for c in cameras]
     chosen = sorted(range(len(cameras)), key=lambda k: -changes[k])[:_SHOWN]
-    rows = [torch.cat([views.image(cameras[k], model) for model in (gaussians, gone, after)], 2) for k in chosen]
-    width = max(row.shape[2] for row in rows)
-    whole = torch.cat([torch.nn.functional.pad(row, (0, width - row.shape[2])) for row in rows], 1)
-    write_picture(Path(path), Image.fromarray(to_bytes(whole).numpy()))
+    rows = [
+        [(name, Image.fromarray(to_bytes(views.image(cameras[k], model)).numpy())) for name, model in
+         ((str(cameras[k].image_name), gaussians), ("", gone), ("", after))]
+        for k in chosen
+    ]  # fmt: skip
+    write_picture(Path(path), sheet(("before", "gone", "after"), rows, WIDEST))
