@@ -92,11 +92,8 @@ def main() -> None:
         scene = of_folder(options, args)
     if len(scene.gaussians) == 0:
         raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
-    page = Page(
-        args.port, scene, pipeline, options.white_background, scene.halves, kept(scene, args, pipeline, options)
-    )
-    if before:
-        page.before_training()
+    shown = kept(scene, args, pipeline, options), before
+    page = Page(args.port, scene, pipeline, options.white_background, scene.halves, *shown)
     try:
         raise serve(page)
     finally:

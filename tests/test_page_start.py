@@ -18,9 +18,10 @@ from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
 from splatting.camera_paths import without_scene
 from splatting.camera_paths.poses import Poses, poses_of
+from splatting.camera_paths.start import LEAST, best_start, narrowed
 from splatting.exports import cleaning
 from splatting.exports.formats import Around, format_of
-from splatting.exports.page_start import LEAST, PICTURE, best_start, named, narrowed, write_preview
+from splatting.exports.page_start import PICTURE, named, write_preview
 from utils.system_utils import UserError
 
 
@@ -53,7 +54,7 @@ def test_a_start_is_named_with_or_without_its_ending():
 def test_a_photo_fills_the_width_of_a_window_unless_that_is_very_wide():
     fov = math.radians(40)
     assert narrowed(fov, 1.5, 1.5) == narrowed(fov, 1.5, 0.5) == pytest.approx(fov)
-    assert math.tan(narrowed(fov, 1.44, 1.6) / 2) * 1.6 == pytest.approx(math.tan(fov / 2) * 1.44)
+    assert math.tan(narrowed(fov, 1.5, 1.6) / 2) * 1.6 == pytest.approx(math.tan(fov / 2) * 1.5)
     assert math.tan(narrowed(fov, 0.5, 2.0) / 2) == pytest.approx(LEAST * math.tan(fov / 2))
 
 

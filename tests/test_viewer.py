@@ -19,6 +19,8 @@ from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.splats.reading import read_splats
 from splatting.camera_paths.keyframes import read_camera_path
+from splatting.camera_paths.poses import poses_of
+from splatting.camera_paths.start import best_start
 from splatting.viewer import legend, path_tab, views
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
 from splatting.viewer.page import write_crop
@@ -208,6 +210,23 @@ def test_an_image_is_shown_only_where_it_was_taken_and_drawn_once(gaussians, sce
     frames.masks = lambda of: torch.zeros(1, of.image_height, of.image_width, dtype=torch.bool)
     masked = frames.draw(replace(asked, slider=1.0), pose, False, 4).image
     assert (plain - masked).max() > 50 and (masked <= plain).all()
+
+
+@pytest.mark.parametrize("aspect", [0.46, 1.0, 1.6])
+def test_a_view_of_all_cameras_has_them_all_in_its_window(scene_cameras, aspect):
+    place, axes, target = scene_cameras.overview()
+    places = [camera_center(camera.R, camera.T) for camera in scene_cameras.by_name.values()]
+    inner = (np.array([*places, target]) - place) @ axes
+    slope = math.tan(views.overview_fov(aspect) / 2)
+    across, high = np.abs(inner[:, :2] / inner[:, 2:]).max(0) / (aspect * slope, slope)
+    assert (inner[:, 2] > 0).all() and max(across, high) <= 0.8 + 1e-9 and across > 0.05
+    assert axes[:, 2] @ scene_cameras.up == pytest.approx(-math.sin(math.radians(35)))  # from above
+
+
+def test_a_page_begins_at_the_camera_that_an_exported_one_begins_at(scene_cameras):
+    train = [camera for name, camera in scene_cameras.by_name.items() if name.startswith("train")]
+    assert scene_cameras.by_name[scene_cameras.start] is train[best_start(poses_of(train))]
+    assert SceneCameras([], []).start == ""
 
 
 @pytest.mark.parametrize("share", [STILL, MOVING])

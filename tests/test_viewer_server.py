@@ -20,6 +20,7 @@ from waiting import wait_for  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from scene import Scene  # noqa: E402
+from splatting.camera_paths.start import LEAST  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer import watchers  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
@@ -262,6 +263,29 @@ def test_browsers_begin_at_the_chosen_camera_and_render_alone_leads_nowhere(page
         wait_for(lambda: page.view.mode.value == "Depth")
         assert not images.slider.visible
         assert next(iter(page.server.get_clients().values())).camera.position[0] == 7.0
+
+
+def _fov(client: Client) -> float:
+    message = {"initial": True}  # what the page begins with, without a window
+    while message.get("initial"):
+        message = client.until("SetCameraFovMessage")
+    return message["fov"]
+
+
+def test_a_browser_begins_with_most_of_a_photos_height_in_windows_of_any_shape(page):
+    camera = page.images._cameras.by_name[page.images.camera.value]
+    wxyz = viser.transforms.SO3.from_matrix(np.asarray(camera.R)).wxyz
+    place, photo = camera_center(camera.R, camera.T), math.tan(camera.FoVy / 2)
+    with Client(page.url) as client:
+        client.look(size=(96, 64))  # at the browser's own beginning, before it hears of the page's
+        for size in ((956, 300), (390, 844), (96, 64)):
+            client.look(place, wxyz, size=size)
+            height = math.tan(_fov(client) / 2) / photo
+            assert height == pytest.approx(max(min(1, 1.5 * size[1] / size[0]), LEAST), rel=1e-3)
+        client.look(place, wxyz, fov=0.3)  # the same window: what somebody has set stays
+        client.look(place + 1.0, wxyz, size=(500, 100))  # not where it began
+        client.look(place, wxyz, size=(50, 100))
+        assert math.tan(_fov(client) / 2) / photo == pytest.approx(1, rel=1e-3)
 
 
 def test_cameras_near_a_browser_are_not_drawn_and_a_click_on_another_leads_there(page):

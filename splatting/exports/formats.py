@@ -73,9 +73,10 @@ def _picture_of(page: str | os.PathLike) -> Path:
 
 
 def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None:
+    from splatting.camera_paths.start import best_start
     from splatting.exports.html import write_html  # SciPy and jinja2 take a while to import
     from splatting.exports.notes import read_notes
-    from splatting.exports.page_start import best_start, named, write_preview
+    from splatting.exports.page_start import named, write_preview
 
     solid = None
     if around.walk:

@@ -19,6 +19,7 @@ from splatting.files.image_files import dimmed, to_bytes
 from splatting.viewer import views
 from splatting.viewer.legend import ERROR_SCALE, Legend, count_colors, depth_colors, error_image
 from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
+from utils.graphics_utils import camera_center
 from utils.image_utils import as_float
 
 LONGEST = 1600  # pixels of a frame's longer side, at most
@@ -79,7 +80,9 @@ class Frames:
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
         """The scene's camera whose target this frame shows, None: no target."""
         camera = self._cameras.by_name.get(settings.camera)
-        return camera if camera and _needs_photo(settings) and self._cameras.stands_at(pose, camera) else None
+        if camera is None or not _needs_photo(settings):
+            return None
+        return camera if self._cameras.stands_at(pose, camera_center(camera.R, camera.T), camera.R) else None
 
     def _background(self, settings: Settings) -> Tensor:
         return self.gaussians.get_xyz.new_tensor(settings.background)

@@ -29,12 +29,12 @@ def faded(distances: np.ndarray) -> np.ndarray:
 
 
 class Frusta:
-    """Up to 200 of the scene's cameras, drawn for each browser. chosen: called with a click's event and the name.
+    """Up to 200 of the scene's cameras, drawn for each browser, if they are visible.
 
-    Called by the server's thread alone.
+    chosen: called with a click's event and the name. Called by the server's thread alone.
     """
 
-    def __init__(self, cameras: SceneCameras, chosen: Callable[[Any, str], None]) -> None:
+    def __init__(self, cameras: SceneCameras, chosen: Callable[[Any, str], None], visible: bool) -> None:
         from viser.transforms import SO3
 
         names = list(cameras.by_name)
@@ -48,7 +48,7 @@ class Frusta:
         self._colours = np.uint8([_COLOURS[name.split()[0]] for name in self.names]).reshape(-1, 3)
         self._drawn: dict[int, viser.BatchedMeshHandle] = {}
         self._chosen = chosen
-        self._visible = False
+        self._visible = visible
 
     def came(self, client: "viser.ClientHandle") -> None:
         """Draw the cameras for a browser."""

@@ -54,10 +54,12 @@ class Page:
         white: bool,
         with_exposures: bool,
         kept: Tensor | None = None,
+        untrained: bool = False,
     ) -> None:
         """Start to listen. UserError if that cannot be done. white: the background at first, else black.
 
         port: 0 for any that is free. kept: (N,) bool, what cleaning leaves of the model, if that is known.
+        untrained: the Gaussians are the points of a scene, so that the page shows where all of its cameras stand.
         """
         gaussians, folder = scene.gaussians, Path(scene.model_path)
         self._gaussians, self._antialiasing = gaussians, pipe.antialiasing
@@ -72,8 +74,10 @@ class Page:
         name = scene.loaded_iter if of_file else folder.resolve().name
         self.server, self.url = servers.serve(port, as_utf8(name))
         gui = self.server.gui
-        self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True, visible=not of_file)
-        self.count = gui.add_text("Gaussians", f"{len(gaussians):,}", disabled=True)
+        self.iteration = gui.add_text(
+            "Iteration", str(scene.loaded_iter or 0), disabled=True, visible=not (of_file or untrained)
+        )
+        self.count = gui.add_text("Points" if untrained else "Gaussians", f"{len(gaussians):,}", disabled=True)
         self.tabs = gui.add_tab_group()
         # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.
         degree = gaussians.max_sh_degree if scene.loaded_iter is None else used_degree(gaussians)
@@ -83,7 +87,7 @@ class Page:
             of_model = folder / CROPS, gaussians.get_xyz, degree
             self.view = ViewTab(self.server, *calls, *of_model, background, kept is not None)
         with self.tabs.add_tab("Photos"):
-            self.images = ImagesTab(self.server, self.watchers.changed, self._cameras)
+            self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained)
         with self.tabs.add_tab("Path"):
             self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
         self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))
@@ -96,6 +100,7 @@ class Page:
     # Coroutines, so that viser calls them one after the other: a browser that has left stays away.
     async def _came(self, client: "viser.ClientHandle") -> None:
         async def moved(camera: "viser.CameraHandle") -> None:
+            self.images.fit(client)
             pose = pose_of(camera)
             if pose is not None:
                 self.watchers.moved(client.client_id, pose)
@@ -109,7 +114,7 @@ class Page:
 
     async def _left(self, client: "viser.ClientHandle") -> None:
         self.watchers.left(client.client_id)
-        self.images.frusta.left(client.client_id)
+        self.images.left(client.client_id)
         self._legends.pop(client.client_id, None)
         self._faults.pop(client.client_id, None)
 
@@ -117,11 +122,6 @@ class Page:
         """Show another model from now on. Called by the thread that draws."""
         self._gaussians = self.frames.gaussians = gaussians
         self.show_numbers(iteration, len(gaussians))
-
-    def before_training(self) -> None:
-        """Show that the Gaussians are the points of a scene, and where its cameras stand."""
-        self.iteration.visible, self.count.label = False, "Points"
-        self.images.draw_cameras()
 
     def settings(self) -> Settings:
         """What the controls say now."""

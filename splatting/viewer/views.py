@@ -10,9 +10,9 @@ import numpy as np
 
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
-from splatting.camera_paths.poses import opening
+from splatting.camera_paths.poses import facing, focus_point, opening, poses_of, unit
+from splatting.camera_paths.start import best_start
 from splatting.host.listing import as_utf8
-from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:
     import viser
@@ -27,6 +27,9 @@ _SLIMMEST = 10  # ratio of its sides
 _NEAR = 1e-3  # of the scene's size: a page's camera that close stands at the scene's camera
 _TURNED = 2e-3  # radians
 _MARGIN = 1.1  # of the scene's size, to the distance of the outermost camera
+_ABOVE = math.radians(35)  # by which a view of all cameras looks down
+_OF_ALL = math.radians(50)  # its vertical opening angle
+_FILLED = 0.8  # of the window, at most, by the cameras
 
 
 @dataclass(frozen=True)
@@ -81,20 +84,22 @@ def window_of(camera: "viser.CameraHandle") -> tuple[int, int]:
 class SceneCameras:
     """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`.
 
-    up: their mean upward direction, unit length: images are mostly taken upright. size: of the scene.
+    start: the name of the one that a page begins at, as an exported page does; "" without any. up: their mean upward
+    direction, unit length: images are mostly taken upright. size: of the scene.
     """
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
-        from splatting.camera_paths.poses import focus_point, poses_of, unit  # SciPy takes a while to import
-
         self.by_name: dict[str, Camera] = {
             as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
             for of_set, cameras in (("train", train), ("test", test))
             for index, camera in enumerate(cameras)
         }
-        self._target, self.up, self.size = None, np.array([0.0, -1.0, 0.0]), 1.0
+        self.start, self._target, self.up, self.size = "", None, np.array([0.0, -1.0, 0.0]), 1.0
+        self._places = np.zeros((0, 3))
         if self.by_name:
             poses = poses_of([*train, *test])
+            self.start = list(self.by_name)[best_start(poses_of(train or test))]
+            self._places = poses.positions
             self._target = focus_point(poses)
             self.up = unit(poses.up) if np.linalg.norm(poses.up) > 1e-6 else self.up
             offsets = poses.positions - poses.positions.mean(axis=0)
@@ -125,10 +130,25 @@ class SceneCameras:
             client.camera.up_direction = self.up_at(axes)
             client.camera.fov = fov
 
-    def stands_at(self, pose: Pose, camera: Camera) -> bool:
-        """Whether a page's camera has the place and the direction of a scene's camera."""
-        apart = np.linalg.norm(np.asarray(pose.position) - camera_center(camera.R, camera.T))
-        cosine = (np.trace(rotation_matrix(pose.wxyz).T @ camera.R) - 1) / 2
+    def overview(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A place behind and above all cameras, its axes, and the point it looks at, so that `overview_fov` has all."""
+        ahead, turn = np.zeros(3), np.asarray(self.by_name[self.start].R)
+        for axis in (turn[:, 2], turn[:, 1]):  # the second one for a camera that looks straight down
+            ahead = axis - (axis @ self.up) * self.up
+            if np.linalg.norm(ahead) > 1e-3:
+                break
+        axes = facing(math.cos(_ABOVE) * unit(ahead) - math.sin(_ABOVE) * self.up, self.up)
+        inner = np.vstack([self._places] + ([] if self._target is None else [self._target])) @ axes
+        middle = (inner.min(0) + inner.max(0)) / 2
+        slope = _FILLED * math.tan(_OF_ALL / 2)
+        away = (np.abs(inner - middle)[:, :2].max(1) / slope - (inner - middle)[:, 2]).max()
+        target = axes @ middle
+        return target - max(float(away), self.size) * axes[:, 2], axes, target
+
+    def stands_at(self, pose: Pose, place: np.ndarray, axes: np.ndarray) -> bool:
+        """Whether a page's camera has a place and a direction."""
+        apart = np.linalg.norm(np.asarray(pose.position) - place)
+        cosine = (np.trace(rotation_matrix(pose.wxyz).T @ axes) - 1) / 2
         return bool(apart <= _NEAR * self.size and math.acos(float(np.clip(cosine, -1, 1))) <= _TURNED)
 
 
@@ -143,3 +163,8 @@ def fov_of_canvas(camera: Camera, aspect: float) -> float:
     """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's image."""
     _, height = canvas(camera.image_width, camera.image_height, aspect)
     return 2 * math.atan(math.tan(opening(camera) / 2) * height / camera.image_height)
+
+
+def overview_fov(aspect: float) -> float:
+    """Vertical opening angle, radians, of a window of this aspect that shows what `overview` is to show."""
+    return 2 * math.atan(math.tan(_OF_ALL / 2) / min(1.0, aspect))

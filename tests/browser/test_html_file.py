@@ -16,8 +16,8 @@ from test_html_export import Page as HtmlPage
 
 from gaussian_renderer.free_view import free_view
 from splatting.camera_paths.poses import poses_of
+from splatting.camera_paths.start import narrowed
 from splatting.exports.html import write_html
-from splatting.exports.page_start import narrowed
 from splatting.exports.walking import EYES, solid_of
 
 if TYPE_CHECKING:
