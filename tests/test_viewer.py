@@ -186,6 +186,7 @@ def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
     for mode, sides in ((views.COLOUR, "photo, render, error"), (views.DEPTH, "photo, depth")):
         words = frame(gaussians, at(camera), scene_cameras, camera=name, comparison=views.BESIDE, mode=mode).legend
         assert f"left: {sides}</div>" in words.html()
+        assert words.numbers[-1] == 51 if mode == views.COLOUR else words.numbers != legend.ERROR_SCALE.numbers
     alone = drawn(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).astype(int)
     assert abs(alone[:64, (alone.shape[1] - 96) // 2 :][:, :96] - error).max() <= 1
 
@@ -335,11 +336,14 @@ def _client(**changes: object) -> SimpleNamespace:
 
 def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
     recorded.file.field.value = "fly_1-a"
+    assert all(button.disabled for button in (recorded.play, recorded.saved, *recorded._of_one, recorded._of_file))
     recorded.add(_client())
     with pytest.raises(UserError, match="at least 2 keyframes"):
         recorded.save()
+    assert not any(button.disabled for button in recorded._of_one) and recorded.saved.disabled
     recorded.seconds.value = 1.5
     recorded.add(_client(position=[4, 5, 6]))
+    assert not (recorded.play.disabled or recorded.saved.disabled) and recorded._of_file.disabled
     recorded.add(_client(fov=0.0))  # cannot be drawn, so is no keyframe
     path = read_camera_path(recorded.save())
     assert path.seconds == 1.5 and path.easing == "smooth"
@@ -352,7 +356,11 @@ def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
     recorded.files.value = recorded.files.options[0]  # as viser does by itself
     recorded.open(client := _client())
     assert tuple(recorded.keyframes) == path.keyframes and recorded.easing.value == "smooth"
-    assert recorded.files.options == ("fly_1-a",) == (recorded.file.field.value,) and client.camera.position[0] == 1
+    assert (
+        not recorded._of_file.disabled
+        and recorded.files.options == ("fly_1-a",) == (recorded.file.field.value,)
+        and client.camera.position[0] == 1
+    )
 
 
 def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch):

@@ -21,6 +21,7 @@ from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from scene import Scene  # noqa: E402
 from splatting.camera_paths.start import LEAST  # noqa: E402
+from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer import watchers  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
@@ -235,14 +236,22 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
 
 def test_reset_gives_the_view_its_first_values(page):
     view, first = page.view, Settings(sh_degree=3)
+    assert view.reset.disabled
     view.mode.value, view.scaling.value, view.background.value = "Depth", 0.3, (9, 9, 9)
     view.crop.value, view.box[0].value = True, (7.0, 7.0)
-    wait_for(lambda: view.crop_file.field.visible)
+    wait_for(lambda: view.crop_file.field.visible and not view.reset.disabled)
     with Client(page.url) as client:
         client.look()
         _set(client, _button(page, "Reset"), True)
-        wait_for(lambda: view.read() == first and not view.crop_file.field.visible)
+        wait_for(lambda: view.read() == first and not view.crop_file.field.visible and view.reset.disabled)
     assert view.corners() == first_box(page._gaussians.get_xyz)
+
+
+def test_without_photos_nothing_is_compared_with_them(tmp_path):
+    cameras = circle(np.float32([[0, 0, 0], [1, 1, 1]]))
+    shown = Page(ANY, WithoutScene(model(5), str(tmp_path), "a.ply", cameras), pipeline(), False, False)
+    assert shown.images.comparison.disabled and "Error" not in shown.view.mode.options
+    shown.stop()
 
 
 def test_browsers_begin_at_the_chosen_camera_and_render_alone_leads_nowhere(page):

@@ -74,6 +74,8 @@ class Frames:
                 target = dimmed(target, counts)
             self._compared = key, (target, *drawn)
         target, image, words = self._compared[1]
+        if settings.comparison == views.BESIDE and settings.mode == views.COLOUR:
+            words = ERROR_SCALE  # of the third image
         shown = to_bytes(_fitted(_composed(settings, target, image), pose)).numpy()
         return Frame(shown, words._replace(sides=_sides(settings)))
 

@@ -80,5 +80,7 @@ def error_image(target: Tensor, render: Tensor) -> Tensor:
 
 
 ERROR_SCALE = Legend(
-    "Difference of photo and render in each colour, of 255", tuple(255 / ERROR_GAIN * tick for tick in _TICKS), _GREYS
+    "Error: black where photo and render agree, brighter where they differ, in the colour in which they do (of 255)",
+    tuple(255 / ERROR_GAIN * tick for tick in _TICKS),
+    _GREYS,
 )

@@ -16,6 +16,7 @@ from scene.scene import Scene
 from scene.splats.ply import write_plain_ply
 from scene.splats.splats import drawable, selected, tidy
 from scene.with_splats import splats_of
+from splatting.camera_paths.without_scene import WithoutScene
 from splatting.host.interrupt import DeferredInterrupt
 from splatting.host.listing import as_utf8
 from splatting.host.start import typed_command
@@ -49,7 +50,7 @@ class Page:
     def __init__(
         self,
         port: int,
-        scene: Scene,
+        scene: Scene | WithoutScene,
         pipe: argparse.Namespace,
         white: bool,
         with_exposures: bool,
@@ -80,14 +81,15 @@ class Page:
         self.count = gui.add_text("Points" if untrained else "Gaussians", f"{len(gaussians):,}", disabled=True)
         self.tabs = gui.add_tab_group()
         # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.
+        photos = not isinstance(scene, WithoutScene)
         degree = gaussians.max_sh_degree if scene.loaded_iter is None else used_degree(gaussians)
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
             calls = self.watchers.changed, self.requests.crop
             of_model = folder / CROPS, gaussians.get_xyz, degree
-            self.view = ViewTab(self.server, *calls, *of_model, background, kept is not None)
+            self.view = ViewTab(self.server, *calls, *of_model, background, kept is not None, photos)
         with self.tabs.add_tab("Photos"):
-            self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained)
+            self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained, photos)
         with self.tabs.add_tab("Path"):
             self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
         self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))

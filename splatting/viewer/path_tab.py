@@ -49,6 +49,15 @@ class PathTab:
         buttons, calls = (add, again, delete, self.play, opened), (self.add, self.go, self.delete, self.turn, self.open)
         for button, call in zip(buttons, calls, strict=True):
             button.on_click(serialized(lambda event, call=call: call(event.client), tell))
+        self._of_one, self._of_two, self._of_file = (again, delete), (self.play, self.saved), opened
+        self._grey()
+        self.list_files()
+
+    def _grey(self) -> None:
+        """Let nobody press what needs keyframes that are not there."""
+        for least, buttons in ((1, self._of_one), (2, self._of_two)):
+            for button in buttons:
+                button.disabled = len(self.keyframes) < least
 
     def add(self, client: "viser.ClientHandle") -> None:
         """Append the view of a browser, with what its window shows from top to bottom, if there is room for it."""
@@ -79,6 +88,7 @@ class PathTab:
         names = tuple(f"{n}: at {key.seconds:g} s" for n, key in enumerate(self.keyframes, 1)) or (_NONE,)
         self.chosen.options = names
         self.chosen.value = names[max(index, 0)]
+        self._grey()
 
     def _index(self) -> int:
         if not self.keyframes or self.chosen.value not in self.chosen.options:
@@ -132,7 +142,8 @@ class PathTab:
 
     def list_files(self) -> None:
         """List the saved paths."""
-        self.files.options = self.file.names() or (_NONE,)
+        names = self.file.names()
+        self.files.options, self._of_file.disabled = names or (_NONE,), not names
 
     def open(self, client: "viser.ClientHandle") -> None:
         """Take the keyframes of the chosen file, and go to the first one. UserError for what is no such file."""

@@ -86,6 +86,7 @@ class ViewTab:
 
     changed: called when one of them moves. export: called when the crop box is to be written. folder: for its files.
     positions: (N, 3) of the Gaussians, for a first crop box. cleaned: whether it is known what cleaning leaves.
+    photos: whether there are any, to show errors.
     """
 
     def __init__(
@@ -98,11 +99,10 @@ class ViewTab:
         sh_degree: int,
         background: Vector,
         cleaned: bool,
+        photos: bool,
     ) -> None:
         gui, self._scene = server.gui, server.scene
-        self.mode = gui.add_dropdown("Show", views.MODES)
-        self.scaling = gui.add_slider("Scaling modifier", 0.01, _MOST_SCALING, 0.01, 1.0)
-        self.degree = gui.add_slider("SH degree", 0, max(sh_degree, 1), 1, sh_degree, visible=sh_degree > 0)
+        self.mode = gui.add_dropdown("Show", views.MODES if photos else views.MODES[: views.MODES.index(views.ERROR)])
         self.background = gui.add_rgb("Background", tuple(round(255 * x) for x in background))
         self.cleaning = gui.add_dropdown(
             "Cleaning", views.CLEANINGS, visible=cleaned, hint="what export.py --clean does"
@@ -114,7 +114,13 @@ class ViewTab:
         self.box = [gui.add_vector2(f"{x} from, to", at, step=step) for x, *at in zip("xyz", low, high, strict=True)]
         self.crop_file = FileName(server, folder, "crop", ".ply")
         written = gui.add_button("Export the crop", hint="writes its Gaussians, whatever else is set here")
-        reset = gui.add_button("Reset", color="gray", hint="everything in this tab")
+        with gui.add_folder("Advanced", expand_by_default=False):
+            hint = "size of Gaussians as drawn; the model keeps its own"
+            self.scaling = gui.add_slider("Scaling modifier", 0.01, _MOST_SCALING, 0.01, 1.0, hint=hint)
+            hint = "how much colours change with the direction that they are seen from"
+            last = max(sh_degree, 1)
+            self.degree = gui.add_slider("SH degree", 0, last, 1, sh_degree, hint=hint, visible=sh_degree > 0)
+        self.reset = gui.add_button("Reset", color="gray", hint="everything in this tab", disabled=True)
         self._of_crop = *self.box, self.crop_file.field, written
         self._edges = None
         self._show_box()
@@ -122,11 +128,14 @@ class ViewTab:
         shown = *drawn, self.crop, *self.box
         self._first = [(handle, handle.value) for handle in shown]
         for handle in drawn:
-            handle.on_update(lambda _: changed())
+            handle.on_update(lambda _: (self._grey(), changed()))
         for handle in (self.crop, *self.box):
-            handle.on_update(serialized(lambda _: (self._show_box(), changed())))
+            handle.on_update(serialized(lambda _: (self._show_box(), self._grey(), changed())))
         written.on_click(lambda _: export())
-        reset.on_click(serialized(lambda _: self._reset()))
+        self.reset.on_click(serialized(lambda _: self._reset()))
+
+    def _grey(self) -> None:
+        self.reset.disabled = all(handle.value == value for handle, value in self._first)
 
     def _reset(self) -> None:
         for handle, value in self._first:
@@ -176,11 +185,16 @@ def first_box(positions: Tensor) -> tuple[Vector, Vector]:
 class ImagesTab:
     """Controls for the scene's cameras. changed(dragging): called when what is shown changes.
 
-    all_drawn: browsers begin with all cameras drawn and in view.
+    all_drawn: browsers begin with all cameras drawn and in view. photos: whether the cameras have any.
     """
 
     def __init__(
-        self, server: "viser.ViserServer", changed: Callable[[bool], None], cameras: SceneCameras, all_drawn: bool
+        self,
+        server: "viser.ViserServer",
+        changed: Callable[[bool], None],
+        cameras: SceneCameras,
+        all_drawn: bool,
+        photos: bool,
     ) -> None:
         gui, self._server, self._cameras, self._all_drawn = server.gui, server, cameras, all_drawn
         self.frusta = Frusta(cameras, self._choose, all_drawn)
@@ -189,8 +203,8 @@ class ImagesTab:
             "Camera", names, initial_value=cameras.start or None, hint="the view jumps there"
         )
         again = gui.add_button("Go to the camera")
-        hint = "shown while the view is that of the chosen camera"
-        self.comparison = gui.add_dropdown("Compare", views.COMPARISONS, hint=hint)
+        hint = "shown while the view is that of the chosen camera" if photos else "there are no photos"
+        self.comparison = gui.add_dropdown("Compare", views.COMPARISONS, hint=hint, disabled=not photos)
         self.slider = gui.add_slider("Slider", 0.0, 1.0, 0.005, 0.5, hint="0: render, 1: photo", visible=False)
         shown = gui.add_checkbox("Draw cameras", all_drawn, hint="a click on one jumps there; those near the view fade")
         colours = gui.add_markdown("Training views are blue, test views orange.", visible=all_drawn)
