@@ -22,6 +22,7 @@ from splatting.camera_paths.keyframes import read_camera_path
 from splatting.camera_paths.poses import poses_of
 from splatting.camera_paths.start import best_start
 from splatting.viewer import legend, path_tab, views
+from splatting.viewer.divider import share_at
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
 from splatting.viewer.page import write_crop
 from splatting.viewer.path_tab import PathTab
@@ -172,9 +173,10 @@ def test_left_of_the_slider_is_the_scenes_image_and_right_of_it_the_render(gauss
     top, left = (high - 64) // 2, (wide - 96) // 2
     assert shown.shape == (high, wide, 3)
     inner = shown[top : top + 64, left : left + 96]
-    np.testing.assert_array_equal(inner[:, :23], camera.target(BLACK).permute(1, 2, 0).numpy()[:, :23])
-    np.testing.assert_array_equal(inner[:, 26:], rendered(gaussians, camera)[:, 26:])
-    assert (inner[:, 23:25] == 255).all()  # the slider's line
+    np.testing.assert_array_equal(inner[:, :24], camera.target(BLACK).permute(1, 2, 0).numpy()[:, :24])
+    np.testing.assert_array_equal(inner[:, 24:], rendered(gaussians, camera)[:, 24:])
+    assert share_at((left + 24) / wide, camera, wide, high) == pytest.approx(0.25)
+    assert share_at(-0.1, camera, *size) == 0 and share_at(1.0, camera, *size) == 1
 
 
 def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):

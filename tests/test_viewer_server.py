@@ -297,6 +297,32 @@ def test_a_browser_begins_with_most_of_a_photos_height_in_windows_of_any_shape(p
         assert math.tan(_fov(client) / 2) / photo == pytest.approx(1, rel=1e-3)
 
 
+def test_the_line_between_photo_and_render_is_dragged_where_both_are_shown(page):
+    images = page.images
+    camera = images._cameras.by_name[images.camera.value]
+    place, wxyz = camera_center(camera.R, camera.T), viser.transforms.SO3.from_matrix(np.asarray(camera.R)).wxyz
+    with Client(page.url) as client, _restored(page):
+        client.look(place, wxyz, size=(192, 64))
+        wait_for(page.server.get_clients)
+        assert not images._divider._drawn
+        _set(client, images.comparison, "Slider")
+        wait_for(lambda: images._divider._drawn)
+        (line,) = images._divider._drawn.values()
+        inner = (np.asarray(line.position) - place) @ np.asarray(camera.R)
+        assert line.visible and inner[0] == pytest.approx(0, abs=1e-9) and inner[2] > 0
+        drag = {"phase": "update", "name": "/divider", "instance_index": None, "button": "left", "modifier": None}
+        drag |= {"start_position": [0, 0, 0], "end_position": [0, 0, 0], "start_screen_pos": [0.5, 0.5]}
+        drag |= {"end_screen_pos": [0.625, 0.5], "owner": line._impl.api._owner_id}
+        for phase in ("start", "update"):
+            client.send("SceneNodeDragMessage", **drag | {"phase": phase})
+        wait_for(lambda: images.slider.value == pytest.approx(0.75))  # the photo has half of the window's width
+        inner = (np.asarray(line.position) - place) @ np.asarray(camera.R)
+        assert inner[0] / inner[2] == pytest.approx(0.5 * math.tan(camera.FoVx / 2), rel=1e-3)
+        client.look(place + 0.1, wxyz, size=(192, 64))
+        wait_for(lambda: not line.visible)
+    wait_for(lambda: not images._divider._drawn)
+
+
 def test_cameras_near_a_browser_are_not_drawn_and_a_click_on_another_leads_there(page):
     frusta, cameras = page.images.frusta, page.images._cameras.by_name
     with Client(page.url) as client, _restored(page):

@@ -4,5 +4,6 @@ views, frames, legend        a frame: what the controls ask for, from which came
 watchers                     when to draw: cameras of the browsers, share of time
 server                       where the page listens, and who may ask for it
 page                         the page, and what it writes
-tabs, path_tab, training_tab its controls; frusta: the scene's cameras as a browser draws them
+tabs, *_tab                  its controls
+frusta, divider              the scene's cameras, and the line between photo and render, as a browser draws them
 """

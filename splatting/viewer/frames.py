@@ -19,13 +19,11 @@ from splatting.files.image_files import dimmed, to_bytes
 from splatting.viewer import views
 from splatting.viewer.legend import ERROR_SCALE, Legend, count_colors, depth_colors, error_image
 from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
-from utils.graphics_utils import camera_center
 from utils.image_utils import as_float
 
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
-_LINE = 2  # pixels of the slider's line
 _NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
 
 
@@ -82,9 +80,7 @@ class Frames:
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
         """The scene's camera whose target this frame shows, None: no target."""
         camera = self._cameras.by_name.get(settings.camera)
-        if camera is None or not _needs_photo(settings):
-            return None
-        return camera if self._cameras.stands_at(pose, camera_center(camera.R, camera.T), camera.R) else None
+        return camera if camera and _needs_photo(settings) and self._cameras.stands_at_camera(pose, camera) else None
 
     def _background(self, settings: Settings) -> Tensor:
         return self.gaussians.get_xyz.new_tensor(settings.background)
@@ -132,10 +128,7 @@ def _composed(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
         return torch.cat(panels, dim=2)
     width = target.shape[2]
     column = round(min(max(settings.slider, 0.0), 1.0) * width)
-    composed = torch.cat([target[:, :, :column], image[:, :, column:]], dim=2)
-    if 0 < column < width:
-        composed[:, :, max(0, column - _LINE // 2) : column + _LINE // 2] = 1.0
-    return composed
+    return torch.cat([target[:, :, :column], image[:, :, column:]], dim=2)
 
 
 def _fitted(image: Tensor, pose: Pose) -> Tensor:

@@ -24,7 +24,8 @@ from splatting.viewer import server as servers
 from splatting.viewer.frames import LONGEST, Frames, inside
 from splatting.viewer.legend import Legend
 from splatting.viewer.path_tab import PathTab
-from splatting.viewer.tabs import ImagesTab, ViewTab, serialized
+from splatting.viewer.photos_tab import ImagesTab
+from splatting.viewer.tabs import ViewTab, serialized
 from splatting.viewer.training_tab import Requests
 from splatting.viewer.views import SceneCameras, Settings, Vector, pose_of, window_of
 from splatting.viewer.watchers import Watchers, Wish
@@ -102,11 +103,10 @@ class Page:
     # Coroutines, so that viser calls them one after the other: a browser that has left stays away.
     async def _came(self, client: "viser.ClientHandle") -> None:
         async def moved(camera: "viser.CameraHandle") -> None:
-            self.images.fit(client)
+            self.images.moved(client)
             pose = pose_of(camera)
             if pose is not None:
                 self.watchers.moved(client.client_id, pose)
-                self.images.frusta.moved(client)
 
         self.path.list_files()
         self._legends[client.client_id] = client.gui.add_html("", order=self.count.order + 0.5, visible=False)

@@ -13,6 +13,7 @@ from scene.cameras import Camera
 from splatting.camera_paths.poses import facing, focus_point, opening, poses_of, unit
 from splatting.camera_paths.start import best_start
 from splatting.host.listing import as_utf8
+from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:
     import viser
@@ -150,6 +151,10 @@ class SceneCameras:
         apart = np.linalg.norm(np.asarray(pose.position) - place)
         cosine = (np.trace(rotation_matrix(pose.wxyz).T @ axes) - 1) / 2
         return bool(apart <= _NEAR * self.size and math.acos(float(np.clip(cosine, -1, 1))) <= _TURNED)
+
+    def stands_at_camera(self, pose: Pose, camera: Camera) -> bool:
+        """Whether a page's camera has the place and the direction of a scene's camera."""
+        return self.stands_at(pose, camera_center(camera.R, camera.T), np.asarray(camera.R))
 
 
 def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:

@@ -125,3 +125,32 @@ def test_every_kind_of_control_is_heard(tab, training):
     until(lambda: abs(np.median(_picture(tab)[150:], (0, 1)) - red).max() < 5, "the crop box was not heard")
     tab.get_by_role("button", name="Reset").click()
     until(lambda: labelled(tab, "Background").input_value() == "rgb(0, 0, 0)", "the background stays")
+
+
+def test_the_line_between_photo_and_render_is_dragged_and_the_camera_stays(tab, training):
+    _open(tab, training[0])
+    tab.get_by_role("tab", name="Photos").click()
+    tab.get_by_role("combobox", name="Compare").click()
+    tab.get_by_role("option", name="Slider").click()
+    tab.get_by_text("Photo left of the line").wait_for()
+    share, (x, y) = labelled(tab, "Slider"), (PICTURE[0] / 2, PICTURE[1] / 2)
+
+    def dragged() -> bool:
+        """Whether the line has followed; if it was not drawn yet, the camera turns, and goes back at first."""
+        tab.get_by_role("button", name="Go to the camera").click()
+        tab.mouse.move(x, y)
+        tab.mouse.down()
+        for step in range(1, 11):
+            tab.mouse.move(x - 20 * step, y)
+            time.sleep(0.05)
+        tab.mouse.up()
+        time.sleep(1)
+        return float(share.input_value()) < 0.45
+
+    until(dragged, "the line does not follow the mouse")
+    assert tab.get_by_text("Photo left of the line").is_visible()
+    tab.mouse.move(x + 300, y)
+    tab.mouse.down()
+    tab.mouse.move(x + 300, y - 60, steps=4)
+    tab.mouse.up()
+    tab.get_by_text("No photo was taken from here").wait_for()
