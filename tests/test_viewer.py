@@ -22,6 +22,7 @@ from splatting.camera_paths.keyframes import read_camera_path
 from splatting.camera_paths.poses import poses_of
 from splatting.camera_paths.start import best_start
 from splatting.viewer import legend, path_tab, views
+from splatting.viewer.coverage import Coverage, Covered
 from splatting.viewer.divider import share_at
 from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
 from splatting.viewer.page import write_crop
@@ -163,6 +164,44 @@ def test_what_cleaning_leaves_and_what_it_takes_are_drawn_apart(gaussians):
         assert torch.equal(both, gaussians.get_xyz[part & inside(gaussians.get_xyz, *box)])
         assert shown_part(gaussians, chosen) is gaussians  # nobody has cleaned
     assert shown_part(gaussians, PLAIN, kept) is gaussians
+
+
+def _ahead(camera, x: float, y: float, z: float) -> torch.Tensor:
+    """The point at slopes x and y, by those of the frame's corner, and at depth z."""
+    inner = np.array([x * math.tan(camera.FoVx / 2), y * math.tan(camera.FoVy / 2), 1]) * z
+    return torch.tensor(camera_center(camera.R, camera.T) + np.asarray(camera.R) @ inner, dtype=torch.float32)
+
+
+def test_what_a_training_view_showed_from_there_is_covered(scene_cameras):
+    camera = next(iter(scene_cameras.by_name.values()))
+    places = [(0, 0, 2), (0.98, -0.98, 3), (1.4, 0, 3), (0, -1.4, 3), (0, 0, -2)]
+    covered = Covered(torch.stack([_ahead(camera, *place) for place in places]), [camera]).at(camera.camera_center)
+    torch.testing.assert_close(covered, torch.tensor([1.0, 1, 0, 0, 0]), atol=1e-4, rtol=0)
+    middle = _ahead(camera, 0, 0, 3)
+    for degrees, share in ((20, 1.0), (38, 0.55), (55, 0.0), (180, 0.0)):
+        turn = torch.tensor(Rotation.from_rotvec(np.radians(degrees) * np.asarray(camera.R)[:, 1]).as_matrix()).float()
+        eye = middle + turn @ (camera.camera_center - middle)
+        assert float(Covered(middle[None], [camera]).at(eye)) == pytest.approx(share, abs=0.05), degrees
+    some = torch.stack([_ahead(camera, x, 0, 3) for x in (0.0, 0.5, 3, -3)])
+    guesses = Coverage([camera], scene_cameras.size).guesses(some, camera.camera_center)[:, 0]
+    torch.testing.assert_close(guesses, torch.tensor([0.0, 0, 1, 1]), atol=0.02, rtol=0)
+
+
+def test_guesses_are_dark_and_photos_are_not(gaussians, scene_cameras):
+    camera = next(iter(scene_cameras.by_name.values()))
+    frames = Frames(gaussians, scene_cameras, pipeline(), False)
+    frames.coverage = Coverage([camera], scene_cameras.size)
+    there = at(camera, camera.image_width, camera.image_height)
+    behind = 2 * _ahead(camera, 0, 0, 4).numpy() - camera_center(camera.R, camera.T)
+    half_turn = Rotation.from_matrix(np.asarray(camera.R) @ np.diag([-1.0, 1, -1])).as_quat(scalar_first=True)
+    for pose, share in ((there, 1.0), (replace(there, position=tuple(behind), wxyz=tuple(half_turn)), 0.12)):
+        plain, dark = (frames.draw(replace(PLAIN, darken=on), pose, False).image.astype(float) for on in (False, True))
+        assert plain.max() > 50 and (dark <= plain).all()
+        assert dark.sum() == pytest.approx(share * plain.sum(), rel=0.25)  # some is background
+    red = frames.draw(
+        replace(PLAIN, darken=True, background=(1.0, 0.0, 0.0)), replace(there, position=(9e3,) * 3), False
+    )
+    assert (red.image == (255, 0, 0)).all()  # where no Gaussian is, nothing is guessed
 
 
 @pytest.mark.parametrize("size", [(300, 100), (96, 64), (60, 200)])

@@ -235,7 +235,7 @@ def test_a_crop_is_written_into_the_models_folder_and_nowhere_else(page, capfd):
 
 
 def test_reset_gives_the_view_its_first_values(page):
-    view, first = page.view, Settings(sh_degree=3)
+    view, first = page.view, Settings(sh_degree=3, darken=True)
     assert view.reset.disabled
     view.mode.value, view.scaling.value, view.background.value = "Depth", 0.3, (9, 9, 9)
     view.crop.value, view.box[0].value = True, (7.0, 7.0)

@@ -17,6 +17,7 @@ from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from splatting.files.image_files import dimmed, to_bytes
 from splatting.viewer import views
+from splatting.viewer.coverage import Coverage, darkened
 from splatting.viewer.legend import ERROR_SCALE, Legend, count_colors, depth_colors, error_image
 from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
 from utils.image_utils import as_float
@@ -37,7 +38,8 @@ class Frame(NamedTuple):
 class Frames:
     """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for an image beside its target.
 
-    kept: (N,) bool, what cleaning leaves, None: nobody asked. Used by one thread. Nothing of the model changes.
+    kept: (N,) bool, what cleaning leaves, None: nobody asked. coverage: of the training views, None: not known. Used by
+    one thread. Nothing of the model changes.
     """
 
     def __init__(
@@ -48,6 +50,7 @@ class Frames:
         self._pipe = pipe
         self._with_exposures = with_exposures
         self.kept: Tensor | None = None
+        self.coverage: Coverage | None = None
         self.masks: Callable[[Camera], Tensor | None] = lambda _: None  # pixels of a photo that train, None: all
         self._compared: tuple[object, tuple[Tensor, Tensor, Legend]] = (None, ())
 
@@ -96,8 +99,14 @@ class Frames:
                 return depth_colors(planes["depth"], planes["alpha"])
             return planes["alpha"].expand(3, -1, -1), Legend()
         exposed = self._with_exposures and target is not None
+        coverage = self.coverage if settings.darken and target is None else None
         options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
-        colour = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)["render"]
+        if coverage is not None:
+            options["features"] = coverage.guesses(part.get_xyz, view.camera_center)
+        drawn = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)
+        colour = drawn["render"]
+        if coverage is not None:
+            return darkened(colour, drawn["features"]), Legend()
         if settings.mode == views.ERROR and target is not None:
             return error_image(target, colour), ERROR_SCALE
         return colour, Legend()

@@ -21,6 +21,7 @@ from splatting.host.interrupt import DeferredInterrupt
 from splatting.host.listing import as_utf8
 from splatting.host.start import typed_command
 from splatting.viewer import server as servers
+from splatting.viewer.coverage import Coverage
 from splatting.viewer.frames import LONGEST, Frames, inside
 from splatting.viewer.legend import Legend
 from splatting.viewer.path_tab import PathTab
@@ -64,15 +65,17 @@ class Page:
         untrained: the Gaussians are the points of a scene, so that the page shows where all of its cameras stand.
         """
         gaussians, folder = scene.gaussians, Path(scene.model_path)
+        of_file = isinstance(scene.loaded_iter, str)  # its name
         self._gaussians, self._antialiasing = gaussians, pipe.antialiasing
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
         self.frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.frames.kept = kept
+        if not (of_file or untrained):
+            self.frames.coverage = Coverage(scene.getTrainCameras(), self._cameras.size)
         self.watchers = Watchers()
         self.requests = Requests(self.watchers.wake)
         self._faults: dict[int, str] = {}  # of the browsers' last frames
         self._legends: dict[int, viser.GuiHtmlHandle] = {}
-        of_file = isinstance(scene.loaded_iter, str)  # its name
         name = scene.loaded_iter if of_file else folder.resolve().name
         self.server, self.url = servers.serve(port, as_utf8(name))
         gui = self.server.gui
@@ -88,7 +91,8 @@ class Page:
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
             calls = self.watchers.changed, self.requests.crop
             of_model = folder / CROPS, gaussians.get_xyz, degree
-            self.view = ViewTab(self.server, *calls, *of_model, background, kept is not None, photos)
+            known = kept is not None, photos, self.frames.coverage is not None
+            self.view = ViewTab(self.server, *calls, *of_model, background, *known)
         with self.tabs.add_tab("Photos"):
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained, photos)
         with self.tabs.add_tab("Path"):

@@ -80,7 +80,7 @@ class ViewTab:
 
     changed: called when one of them moves. export: called when the crop box is to be written. folder: for its files.
     positions: (N, 3) of the Gaussians, for a first crop box. cleaned: whether it is known what cleaning leaves.
-    photos: whether there are any, to show errors.
+    photos: whether there are any, to show errors. covered: whether it is known what training views have shown.
     """
 
     def __init__(
@@ -94,9 +94,12 @@ class ViewTab:
         background: Vector,
         cleaned: bool,
         photos: bool,
+        covered: bool,
     ) -> None:
         gui, self._scene = server.gui, server.scene
         self.mode = gui.add_dropdown("Show", views.MODES if photos else views.MODES[: views.MODES.index(views.ERROR)])
+        hint = "what no training photo shows from about this direction; there the model guesses"
+        self.darken = gui.add_checkbox("Darken guesses", covered, hint=hint, visible=covered)
         self.background = gui.add_rgb("Background", tuple(round(255 * x) for x in background))
         self.cleaning = gui.add_dropdown(
             "Cleaning", views.CLEANINGS, visible=cleaned, hint="what export.py --clean does"
@@ -118,7 +121,7 @@ class ViewTab:
         self._of_crop = *self.box, self.crop_file.field, written
         self._edges = None
         self._show_box()
-        drawn = self.mode, self.scaling, self.degree, self.background, self.cleaning
+        drawn = self.mode, self.darken, self.scaling, self.degree, self.background, self.cleaning
         shown = *drawn, self.crop, *self.box
         self._first = [(handle, handle.value) for handle in shown]
         for handle in drawn:
@@ -157,6 +160,7 @@ class ViewTab:
         box = self.corners() if self.crop.value else None
         return Settings(
             mode=self.mode.value,
+            darken=self.darken.value,
             scaling=min(max(self.scaling.value, 0.0), _MOST_SCALING),
             sh_degree=max(int(self.degree.value), 0),
             background=tuple(min(max(x / 255, 0.0), 1.0) for x in self.background.value),

@@ -49,14 +49,15 @@ class Pose:
 
 @dataclass(frozen=True)
 class Settings:
-    """mode: of MODES. scaling: factor of all scales. sh_degree: highest that is drawn. background: RGB in [0, 1].
+    """mode: of MODES. darken: what no training view has shown. scaling: factor of all scales.
 
-    crop: opposite corners of the box outside of which nothing is drawn, world coordinates, or None. cleaning: of
-    CLEANINGS. camera: name of the chosen camera, None: none. comparison: of COMPARISONS. slider: share of the width
-    that is the scene's image.
+    sh_degree: highest that is drawn. background: RGB in [0, 1]. crop: opposite corners of the box outside of which
+    nothing is drawn, world coordinates, or None. cleaning: of CLEANINGS. camera: name of the chosen camera, None: none.
+    comparison: of COMPARISONS. slider: share of the width that is the scene's image.
     """
 
     mode: str = COLOUR
+    darken: bool = False
     scaling: float = 1.0
     sh_degree: int = 3
     background: Vector = (0.0, 0.0, 0.0)
