@@ -2,6 +2,7 @@
 
 python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
 python render.py -m MODEL --path {interpolate,ellipse,spiral,FILE.json} [--fps N] [--size W H] [--seconds S] [--frames]
+python render.py -m MODEL --path top [--size W H]
 python render.py -s SCENE -m OUT --ply FILE
 
 Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
@@ -10,7 +11,7 @@ is idle before the clock starts, and done when it stops. --depth and --alpha wri
 of these names, 16-bit PNGs with their scale in a text chunk (splatting/files/image_files.py). Of COLMAP scenes, --depth
 also writes depth_errors.json, the errors at points that no training was supervised by, for metrics.py.
 
-With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (splatting/camera_paths/render_path.py).
+With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (splatting/camera_paths/render_path.py), or top.png.
 """
 
 from __future__ import annotations
@@ -249,7 +250,12 @@ def main() -> None:
         from splatting.camera_paths.without_scene import saved_scene  # as above
 
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
-        render_path(scene, pipeline, background, request)
+        if request.make is None:
+            from splatting.camera_paths.from_above import render_top  # as above
+
+            render_top(scene, options.source_path, pipeline, background, request.size)
+        else:
+            render_path(scene, pipeline, background, request)
         return
     chosen = {
         "sh_degree": args.typed_sh_degree,

@@ -11,14 +11,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from gaussians import model
+import torch
+from gaussians import model, pipeline
 from PIL import Image
 
 from scene.cameras import camera_to_JSON
 from scene.dataset_readers import read_scene
-from splatting.camera_paths import render_path
+from scene.with_splats import model_of
+from splatting.camera_paths import from_above, render_path
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
 from splatting.camera_paths.video import write_video
+from splatting.camera_paths.without_scene import WithoutScene, circle
+from splatting.viewer.untrained import _spheres
 from utils.system_utils import UserError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")
@@ -231,3 +235,36 @@ def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
     with pytest.raises(KeyboardInterrupt):
         write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
     assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
+
+
+def test_a_picture_from_above_is_to_scale_whatever_the_height_and_without_what_no_camera_is_above(tmp_path, capsys):
+    places = np.float32([[-1, 0.9, -1], [1, -0.3, -0.5], [0.3, 0.5, 1], [0, -40, 0]])
+    gaussians = model_of(_spheres(places, np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), 0.05))
+    scene = WithoutScene(gaussians, str(tmp_path), 7, circle(places[:3]))
+    background, pipe = torch.zeros(3), pipeline()
+    path = from_above.render_top(scene, "", pipe, background, (400, 300))
+    said = capsys.readouterr().out
+    assert said.startswith(f"{path}: 400 x 300, a pixel is ") and said.endswith(" of the scene's units\n")
+    image = read(path).astype(float)
+    assert image.shape == (300, 400, 3) and image.min(2).max() < 10  # nothing is white
+    centers = []
+    for channel in range(3):
+        rows, columns = (image[..., channel] * (image[..., channel] > 50)).nonzero()
+        centers.append((columns.mean(), rows.mean()))
+    seen = np.array(centers) * float(said.split()[-5])
+    true = places[:3, [0, 2]] * [1, -1]  # the first camera looks along z, which is up in the picture
+    np.testing.assert_allclose(seen - seen[0], true - true[0], atol=0.02)
+    record = {"rotation": [[0, 0, 1], [0, 1, 0], [-1, 0, 0]], "scale": 2.0, "translation": [0, 0, 0], "unit": "metre"}
+    (tmp_path / "model.json").write_text(json.dumps({"similarity": record}))
+    from_above.render_top(scene, "", pipe, background, None)
+    assert capsys.readouterr().out.endswith(" m\n")
+    turned = read(path)
+    rows, columns = (turned[..., 0] > 100).nonzero()
+    assert columns.mean() < 0.5 * turned.shape[1] and rows.mean() < 0.5 * turned.shape[0]  # x is -1, and so is z
+
+
+@pytest.mark.parametrize("words", ["--fps 10", "--seconds 3", "--frames"])
+def test_a_picture_from_above_has_no_options_of_videos(run, words):
+    with pytest.raises(UserError, match=f"is one picture, without {words.split()[0]}"):
+        run("--path", "top", *words.split())
+    assert (run("--path", "top", "--size", 64, 48) / "top.png").is_file()

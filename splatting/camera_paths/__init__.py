@@ -4,4 +4,5 @@ keyframes, poses        a path's file and its pose at each moment, cameras as ar
 generated               paths made from the training cameras
 start                   the camera that pages begin at
 render_path, video      a video of a path
+from_above              a picture from above
 """

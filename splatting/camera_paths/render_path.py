@@ -22,6 +22,8 @@ from splatting.files.image_files import remove_leftovers, save_png, to_bytes
 from splatting.host.progress import Bar
 from utils.system_utils import UserError
 
+TOP = "top"  # the picture of from_above.py
+
 if TYPE_CHECKING:
     from splatting.camera_paths.poses import Poses
     from splatting.camera_paths.without_scene import WithoutScene
@@ -31,14 +33,15 @@ MOST_FPS = 240
 LARGEST_SIDE = 16384  # of x264
 LEAST_SECONDS, MOST_SECONDS = 0.1, 3600
 _WITH_PATH = ("fps", "size", "seconds", "frames")
+_OF_VIDEOS = ("fps", "seconds", "frames")
 _WITHOUT_PATH = ("depth", "alpha")
 
 
 def add_path_options(parser: argparse.ArgumentParser) -> None:
     """Add --path and what goes with it to a parser."""
     group = parser.add_argument_group("Camera path")
-    kinds = "interpolate, ellipse, spiral, or a JSON file of keyframes"
-    group.add_argument("--path", metavar="PATH", help=f"write a video along {kinds}, and no views (default: none)")
+    kinds = "interpolate, ellipse, spiral, or a JSON file of keyframes, or a picture from above: top"
+    group.add_argument("--path", metavar="PATH", help=f"write a video along {kinds}; no views (default: none)")
     group.add_argument("--fps", type=int, metavar="N", help="frames a second (default: 30)")
     size = "width and height, even (default: that of the first training camera, made even)"
     group.add_argument("--size", type=int, nargs=2, metavar=("W", "H"), help=size)
@@ -48,14 +51,14 @@ def add_path_options(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class PathRequest:
-    """A video to make.
+    """A video to make, or a picture from above.
 
-    name: of its files. make: the path of the training cameras' poses. fps: frames a second. size: width and height,
-    even, None: those of the first training camera, made even. frames: whether to write PNGs, too.
+    name: of its files. make: the path of the training cameras' poses, None: from above. fps: frames a second.
+    size: width and height, even, None: those of the first training camera, made even. frames: whether to write PNGs.
     """
 
     name: str
-    make: Callable[["Poses"], TimedPath]
+    make: Callable[["Poses"], TimedPath] | None
     fps: int = FPS
     size: tuple[int, int] | None = None
     frames: bool = False
@@ -73,6 +76,11 @@ def path_request(args: argparse.Namespace) -> PathRequest | None:
             raise UserError(f"--{name} works only {kind}; leave it out, {remedy}")
     if args.path is None:
         return None
+    if args.path == TOP:
+        for name in _OF_VIDEOS:
+            if getattr(args, name) not in (None, False):
+                raise UserError(f"--path {TOP} is one picture, without --{name}; leave it out")
+        return PathRequest(TOP, None, size=args.size and _checked_size(*args.size))
     fps = FPS if args.fps is None else args.fps
     if not 1 <= fps <= MOST_FPS:
         raise UserError(f"--fps must be 1 to {MOST_FPS}, got {fps}")

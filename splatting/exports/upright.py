@@ -4,7 +4,6 @@ import argparse
 import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,8 +12,8 @@ from scene.cameras import Camera
 from scene.splats.splats import Splats, rotated
 from splatting.camera_paths.keyframes import Keyframe, TimedPath
 from splatting.camera_paths.poses import keyframe, poses_of
-from splatting.files.json_files import OFFSET, read_model_json
-from splatting.files.similarity import ENTRY, Similarity, read_orientation
+from splatting.files.json_files import read_model_json
+from splatting.files.similarity import ENTRY, Similarity, local_similarity, recorded_similarity
 from utils.system_utils import UserError
 
 
@@ -31,7 +30,7 @@ def check_upright(args: argparse.Namespace) -> None:
         raise UserError("--upright and --no_upright contradict each other; leave one out")
     if not args.upright:
         return
-    if (record := _record(args).get(ENTRY)) is None:
+    if (record := recorded_similarity(args.model_path, args.source_path).get(ENTRY)) is None:
         raise UserError(
             "--upright needs a model folder (-m) of a scene that was oriented; run convert.py --orient on it, or leave "
             "--upright out"
@@ -45,25 +44,16 @@ def oriented_later(args: argparse.Namespace) -> bool:
     return args.upright and ENTRY not in read_model_json(args.model_path)
 
 
-def _record(args: argparse.Namespace) -> dict[str, Any]:
-    """model.json, with the similarity of the scene where that was oriented after the training."""
-    record = read_model_json(args.model_path) if args.model_path else {}
-    if args.model_path and args.source_path and ENTRY not in record:
-        found = read_orientation(Path(args.source_path))
-        record = record if found is None else record | {ENTRY: found}
-    return record
-
-
 def placed(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any) -> tuple[Splats, Any]:
     """The splats, and the `Around` of a page or mesh (`of_scene`), in the frame that the options ask for.
 
     They have passed `check_upright`.
     """
-    record = _record(args)
-    if args.no_upright or not (args.upright or of_scene) or ENTRY not in record:
+    local = None
+    if not args.no_upright and (args.upright or of_scene):
+        local = local_similarity(args.model_path, args.source_path)
+    if local is None:
         return splats, around
-    similarity = Similarity.of(record[ENTRY], f"orientation of {args.model_path}")
-    local = similarity.from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))
     return moved_splats(splats, local), moved_around(around, local) if around else around
 
 

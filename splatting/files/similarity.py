@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from splatting.files.json_files import LARGEST_OFFSET, read_json
+from splatting.files.json_files import LARGEST_OFFSET, OFFSET, read_json, read_model_json
 from splatting.host.errors import UserError
 
 FILE = "orientation.json"  # of convert.py --orient, in a scene's folder
@@ -22,7 +22,7 @@ class Similarity:
 
     There y is down, as in a usual capture. rotation: (3,3). place: latitude and longitude (degrees) and height (metres)
     of the origin, where x is east and z north, in metres; empty: unknown. upright: the vertical is known; else only the
-    scale changes. metric: a unit is a metre then.
+    scale changes. metric: there, a unit is a metre.
     """
 
     rotation: np.ndarray
@@ -49,9 +49,8 @@ class Similarity:
                 f"{where} has no rotation, scale and translation of a similarity that a scene may have; run convert.py "
                 "--orient again"
             ) from error
-        return cls(
-            rotation, scale, translation, place, record.get("vertical", "") is not None, record.get("unit") == "metre"
-        )
+        known = record.get("vertical", "") is not None, record.get("unit") == "metre"
+        return cls(rotation, scale, translation, place, *known)
 
     def from_local(self, offset: np.ndarray) -> "Similarity":
         """The similarity for coordinates from which an offset (3,) of the world was subtracted."""
@@ -74,3 +73,18 @@ def read_orientation(scene: Path) -> dict[str, Any] | None:
         raise UserError(f"{path} is not JSON; run convert.py --orient again, or remove it") from error
     Similarity.of(record, str(path))
     return record
+
+
+def recorded_similarity(model: str, scene: str) -> dict[str, Any]:
+    """model.json of a model's folder, with the similarity of the scene where that was oriented after the training."""
+    record = read_model_json(model) if model else {}
+    found = read_orientation(Path(scene)) if scene and ENTRY not in record else None
+    return record if found is None else record | {ENTRY: found}
+
+
+def local_similarity(model: str, scene: str) -> Similarity | None:
+    """The similarity of a model's own coordinates, which may have an offset; None if its scene was not oriented."""
+    record = recorded_similarity(model, scene)
+    if ENTRY not in record:
+        return None
+    return Similarity.of(record[ENTRY], f"orientation of {model}").from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))
