@@ -92,7 +92,8 @@ def main() -> None:
         scene = of_folder(options, args)
     if len(scene.gaussians) == 0:
         raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
-    shown = kept(scene, args, pipeline, options), before
+    oriented = options.source_path if os.path.isdir(options.source_path or "") else ""
+    shown = kept(scene, args, pipeline, options), before, None if args.file else oriented
     page = Page(args.port, scene, pipeline, options.white_background, scene.halves, *shown)
     try:
         raise serve(page)

@@ -18,6 +18,7 @@ from gaussian_renderer.free_view import free_view
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.splats.reading import read_splats
+from scene.with_splats import model_of
 from splatting.camera_paths.keyframes import read_camera_path
 from splatting.camera_paths.poses import poses_of
 from splatting.camera_paths.start import best_start
@@ -28,6 +29,7 @@ from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
 from splatting.viewer.page import write_crop
 from splatting.viewer.path_tab import PathTab
 from splatting.viewer.tabs import FileName
+from splatting.viewer.untrained import _spheres
 from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
 from splatting.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from utils.graphics_utils import camera_center
@@ -185,6 +187,14 @@ def test_what_a_training_view_showed_from_there_is_covered(scene_cameras):
     some = torch.stack([_ahead(camera, x, 0, 3) for x in (0.0, 0.5, 3, -3)])
     guesses = Coverage([camera], scene_cameras.size).guesses(some, camera.camera_center)[:, 0]
     torch.testing.assert_close(guesses, torch.tensor([0.0, 0, 1, 1]), atol=0.02, rtol=0)
+
+
+def test_the_surface_along_a_ray_is_found_where_there_is_one():
+    gaussians = model_of(_spheres(np.float32([[0.5, -0.2, 0]]), np.ones((1, 3), np.float32), 0.05))
+    frames = Frames(gaussians, SceneCameras([], []), pipeline(), False)
+    ray = np.array([0.5, -0.2, 4]) / np.linalg.norm([0.5, -0.2, 4])
+    np.testing.assert_allclose(frames.surface(PLAIN, FRONT, ray), [0.5, -0.2, 0], atol=1e-3)
+    assert frames.surface(PLAIN, FRONT, np.array([0.0, 0, 1])) is None
 
 
 def test_guesses_are_dark_and_photos_are_not(gaussians, scene_cameras):

@@ -20,12 +20,15 @@ from waiting import wait_for  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from scene import Scene  # noqa: E402
+from scene.with_splats import model_of  # noqa: E402
 from splatting.camera_paths.start import LEAST  # noqa: E402
 from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
+from splatting.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer import watchers  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
 from splatting.viewer.tabs import first_box  # noqa: E402
+from splatting.viewer.untrained import _spheres  # noqa: E402
 from splatting.viewer.views import Settings  # noqa: E402
 from utils.graphics_utils import camera_center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
@@ -354,3 +357,52 @@ def test_a_path_is_saved_with_the_command_of_its_video_and_what_fails_is_red(pag
         _set(client, page.path.saved, True)
         assert client.until("NotificationShowMessage")["props"]["title"] == "Saved"
     assert capfd.readouterr().out.strip().endswith("camera_paths/path1.json' --size 120 80")
+
+
+def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path, capsys):
+    places = np.float32([[-1, 0.5, 0], [1, 0.5, 0], [0, 0.5, 2], [0, -0.5, 1]])
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/model.json").write_text("{}")
+    gaussians = model_of(_spheres(places, np.ones((4, 3), np.float32), 0.05))
+    gaussians.world_offset = (10.0, 0.0, 0.0)
+    shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle(places))
+    page = Page(ANY, shown, pipeline(), False, False, oriented=str(tmp_path / "scene"))
+    tab = page.measure
+    with Client(page.url) as client:
+        client.look()
+        wait_for(page.server.get_clients)
+
+        def click(tool: str, rows: tuple[int, ...]) -> None:
+            tab.tool.value = tool
+            wait_for(lambda: page.server.scene._scene_pointer_cb)
+            for number, row in enumerate(rows, 1):
+                ray = places[row] - [0, 0, -4]
+                sent = {"ray_origin": (0.0, 0.0, -4.0), "ray_direction": (ray / np.linalg.norm(ray)).tolist()}
+                client.send("ScenePointerMessage", event_type="click", screen_pos=((0.5, 0.5),), modifier=None, **sent)
+                wait_for(lambda: page.requests.any)
+                answer(page)
+                assert len(tab.points[tool]) == number
+
+        click("A length", (0, 1))
+        assert tab.length == pytest.approx(2, abs=1e-2) and "units of the scene" in tab.says.content
+        assert tab.keep.disabled
+        with pytest.raises(UserError, match="nothing to set right"):
+            tab.write()
+        tab.metres.value = 5.0
+        wait_for(lambda: not tab.keep.disabled)
+        click("The ground", (0, 1, 2))
+        assert "tilted by 0." in tab.says.content
+        click("The front", (2, 1))
+        _set(client, tab.keep, True)
+        wait_for(lambda: (tmp_path / "scene/orientation.json").is_file() and "5 m" in tab.says.content)
+        assert client.until("NotificationShowMessage")["props"]["title"] == "Set right"
+    page.stop()
+    record = read_orientation(tmp_path / "scene")
+    assert recorded_similarity(str(tmp_path / "out"), "")["similarity"] == record
+    found = Similarity.of(record, "here").from_local(np.array([10.0, 0, 0]))
+    assert found.metric and found.scale == pytest.approx(2.5, rel=1e-2)
+    moved = found.points(places)
+    np.testing.assert_allclose(moved[:3, 1], 0, atol=0.03)
+    assert moved[3, 1] == pytest.approx(-2.5, abs=0.05)  # above
+    assert moved[1, 0] > moved[2, 0] and moved[1, 2] == pytest.approx(moved[2, 2], abs=0.03)  # the front is along x

@@ -81,8 +81,7 @@ class TrainingPage:
                 return
             if requests.take_checkpoint():
                 self._save(at)
-            if requests.take_crop():
-                self._page.export_crop()
+            requests.work()
             if not requests.paused or requests.take_step():
                 return
             wish = self._page.watchers.next(at.iteration)

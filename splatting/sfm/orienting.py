@@ -55,6 +55,8 @@ def said_of(layout: Layout) -> list[str]:
         error = record.get("vertical_error")
         level = f"upright: tilted by {turn:.1f} degrees{f' (to {error:.1f})' if error else ''}, by {record['vertical']}"
     if record["unit"] == "metre":
+        if "gps_photos" not in record:
+            return [f"{level}; a unit is {record['scale']:.4g} m, as measured in the viewer"]
         error = f" (to {record['scale_error']:.1%})" if "scale_error" in record else ""
         used = f"GPS of {record['gps_photos']} photos, which fit to {record['gps_error']:.2g} m"
         return [f"{level}; a unit is {record['scale']:.4g} m{error} by {used}"]

@@ -2,6 +2,7 @@
 
 import argparse
 import copy
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,9 +13,11 @@ from torch import Tensor
 
 from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth, view_planes
-from gaussian_renderer.free_view import free_view
+from gaussian_renderer.free_view import free_view, rotation_matrix
+from gaussian_renderer.median_depth import surface_of
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
+from splatting.camera_paths.poses import facing, keyframe
 from splatting.files.image_files import dimmed, to_bytes
 from splatting.viewer import views
 from splatting.viewer.coverage import Coverage, darkened
@@ -25,6 +28,7 @@ from utils.image_utils import as_float
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
+_ASKED = 17  # pixels of the sides of a view of one ray
 _NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
 
 
@@ -79,6 +83,20 @@ class Frames:
             words = ERROR_SCALE  # of the third image
         shown = to_bytes(_fitted(_composed(settings, target, image), pose)).numpy()
         return Frame(shown, words._replace(sides=_sides(settings)))
+
+    def surface(self, settings: Settings, pose: Pose, ray: np.ndarray) -> np.ndarray | None:
+        """The point (3,) of the surface along a ray (3,) of a pose's window; None where there is none.
+
+        A view of few pixels along the ray tells it, each as large as one of the window.
+        """
+        axes = rotation_matrix(pose.wxyz)
+        place, turn = np.array(pose.position), facing(ray, -axes[:, 1])
+        key = keyframe(0.0, place, turn, _ASKED * math.degrees(pose.fov) / pose.height)
+        device = self.gaussians.get_xyz.device
+        view = free_view(_ASKED, _ASKED, math.radians(key.fov), key.position, key.wxyz, device)
+        depth = surface_of(view, shown_part(self.gaussians, settings, self.kept), self._pipe).depth
+        away = float(depth[_ASKED // 2, _ASKED // 2])
+        return place + away * turn[:, 2] if away > 0 else None
 
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
         """The scene's camera whose target this frame shows, None: no target."""

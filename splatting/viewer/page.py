@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +25,12 @@ from splatting.viewer import server as servers
 from splatting.viewer.coverage import Coverage
 from splatting.viewer.frames import LONGEST, Frames, inside
 from splatting.viewer.legend import Legend
+from splatting.viewer.measure_tab import MeasureTab, Place
 from splatting.viewer.path_tab import PathTab
 from splatting.viewer.photos_tab import ImagesTab
 from splatting.viewer.tabs import ViewTab, serialized
 from splatting.viewer.training_tab import Requests
-from splatting.viewer.views import SceneCameras, Settings, Vector, pose_of, window_of
+from splatting.viewer.views import Pose, SceneCameras, Settings, Vector, pose_of, window_of
 from splatting.viewer.watchers import Watchers, Wish
 from utils.system_utils import UserError, first_line
 
@@ -58,11 +60,13 @@ class Page:
         with_exposures: bool,
         kept: Tensor | None = None,
         untrained: bool = False,
+        oriented: str | None = None,
     ) -> None:
         """Start to listen. UserError if that cannot be done. white: the background at first, else black.
 
         port: 0 for any that is free. kept: (N,) bool, what cleaning leaves of the model, if that is known.
         untrained: the Gaussians are the points of a scene, so that the page shows where all of its cameras stand.
+        oriented: the scene's folder, "" without one, if the page may set right how it stands; None: it may not.
         """
         gaussians, folder = scene.gaussians, Path(scene.model_path)
         of_file = isinstance(scene.loaded_iter, str)  # its name
@@ -89,7 +93,7 @@ class Page:
         degree = gaussians.max_sh_degree if scene.loaded_iter is None else used_degree(gaussians)
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
-            calls = self.watchers.changed, self.requests.crop
+            calls = self.watchers.changed, lambda: self.requests.ask(self.export_crop)
             of_model = folder / CROPS, gaussians.get_xyz, degree
             known = kept is not None, photos, self.frames.coverage is not None
             self.view = ViewTab(self.server, *calls, *of_model, background, *known)
@@ -97,6 +101,9 @@ class Page:
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained, photos)
         with self.tabs.add_tab("Path"):
             self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
+        place = None if oriented is None else Place(folder, oriented, gaussians.world_offset)
+        with self.tabs.add_tab("Measure"):
+            self.measure = MeasureTab(self.server, self._cameras, self._find, place, self._tell_set, self._refuse)
         self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))
         self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
         self.server.initial_camera.near = 1e-3 * self._cameras.size
@@ -201,6 +208,14 @@ class Page:
             self.notify("Exported", f"{what}: {CROPS}/{file.name}{replaced}")
             name.suggest()
 
+    def _find(self, pose: Pose, ray: np.ndarray, found: Callable[[np.ndarray | None], None]) -> None:
+        self.requests.ask(lambda: found(self.frames.surface(self.settings(), pose, ray)))
+
+    def _tell_set(self, client: "viser.ClientHandle", files: list[Path]) -> None:
+        names = " and ".join(map(str, files))
+        tqdm.write(as_utf8(f"Set right; written into {names}"), file=sys.stdout)
+        self._notify(client, "Set right", f"exports of this scene stand so from now on: {names}")
+
     def _save_path(self, client: "viser.ClientHandle", folder: Path) -> None:
         replaced, file = self.path.file.replaced(), self.path.save()
         size = (max(2, side - side % 2) for side in window_of(client.camera))
@@ -244,8 +259,7 @@ def answer(page: Page) -> bool:
 
     Whether there was a frame.
     """
-    if page.requests.take_crop():
-        page.export_crop()
+    page.requests.work()
     wish = page.watchers.next()
     if wish is None:
         page.watchers.wait(_WAIT if not page.watchers.any else _BETWEEN)

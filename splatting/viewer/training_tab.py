@@ -24,14 +24,15 @@ class Requests:
 
     def __init__(self, asked: Callable[[], None]) -> None:
         self._asked, self._lock = asked, threading.RLock()
-        self._steps = self._checkpoints = self._crops = 0
+        self._steps = self._checkpoints = 0
+        self._jobs: list[Callable[[], object]] = []
         self.paused = self.stopped = False
         self.any = False  # read without the lock, in every iteration of a training
 
     def _set(self, **values: object) -> None:
         with self._lock:
             vars(self).update(values)
-            self.any = self.paused or self._checkpoints > 0 or self._crops > 0 or self.stopped
+            self.any = self.paused or self._checkpoints > 0 or bool(self._jobs) or self.stopped
             self._asked()
 
     def _take(self, name: str) -> bool:
@@ -57,9 +58,10 @@ class Requests:
         """Save a checkpoint after this iteration."""
         self._set(_checkpoints=1)
 
-    def crop(self) -> None:
-        """Export the Gaussians in the crop box."""
-        self._set(_crops=1)
+    def ask(self, job: Callable[[], object]) -> None:
+        """Call something that needs the model, once."""
+        with self._lock:
+            self._set(_jobs=self._jobs if job in self._jobs else [*self._jobs, job])
 
     def stop(self) -> None:
         """Save a checkpoint after this iteration, and end the training; without a training, close the page."""
@@ -73,12 +75,16 @@ class Requests:
         """Whether to save a checkpoint; if so, that request is fulfilled."""
         return self._take("_checkpoints")
 
-    def take_crop(self) -> bool:
-        """Whether to export the crop box; if so, that request is fulfilled."""
-        return self._take("_crops")
+    def work(self) -> None:
+        """Do what needs the model. Called by the thread that changes it."""
+        with self._lock:
+            jobs = self._jobs
+            self._set(_jobs=[])
+        for job in jobs:
+            job()
 
     def reset(self) -> None:
-        """Forget what a training that is over was asked for, except for a crop."""
+        """Forget what a training that is over was asked for, except for jobs."""
         self._set(paused=False, stopped=False, _steps=0, _checkpoints=0)
 
 

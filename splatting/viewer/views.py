@@ -87,7 +87,7 @@ class SceneCameras:
     """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`.
 
     start: the name of the one that a page begins at, as an exported page does; "" without any. up: their mean upward
-    direction, unit length: images are mostly taken upright. size: of the scene.
+    direction, unit length: images are mostly taken upright. middle: of their places. size: of the scene.
     """
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
@@ -97,14 +97,14 @@ class SceneCameras:
             for index, camera in enumerate(cameras)
         }
         self.start, self._target, self.up, self.size = "", None, np.array([0.0, -1.0, 0.0]), 1.0
-        self._places = np.zeros((0, 3))
+        self._places, self.middle = np.zeros((0, 3)), np.zeros(3)
         if self.by_name:
             poses = poses_of([*train, *test])
             self.start = list(self.by_name)[best_start(poses_of(train or test))]
-            self._places = poses.positions
+            self._places, self.middle = poses.positions, poses.positions.mean(axis=0)
             self._target = focus_point(poses)
             self.up = unit(poses.up) if np.linalg.norm(poses.up) > 1e-6 else self.up
-            offsets = poses.positions - poses.positions.mean(axis=0)
+            offsets = poses.positions - self.middle
             self.size = float(np.linalg.norm(offsets, axis=1).max()) * _MARGIN or 1.0
 
     def up_at(self, axes: np.ndarray) -> Vector:

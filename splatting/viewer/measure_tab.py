@@ -1,0 +1,163 @@
+"""The tab that measures between points that somebody clicks, and sets scale, upright and front right."""
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arguments import add_to_model_json
+from splatting.files.json_files import MODEL_JSON, write_json
+from splatting.files.measured import measured_record
+from splatting.files.similarity import ENTRY, FILE, Similarity, recorded_similarity
+from splatting.viewer.tabs import Tell, serialized
+from splatting.viewer.views import Pose, SceneCameras, pose_of
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    import viser
+
+OFF, LENGTH, GROUND, FRONT = TOOLS = ("Nothing", "A length", "The ground", "The front")
+_POINTS = {LENGTH: 2, GROUND: 3, FRONT: 2}
+_COLOURS = {LENGTH: (255, 200, 0), GROUND: (60, 200, 90), FRONT: (240, 80, 200)}
+_SAYS = {
+    OFF: "Choose what to click.",
+    LENGTH: "Click the two ends of a length.",
+    GROUND: "Click three points of the ground, far from each other.",
+    FRONT: "Click two points, from left to right, of a line that is to be looked at straight on.",
+}
+_SIZE, _WIDTH = 0.006, 0.004  # radius of a point and width of a line, by the scene's size
+
+Find = Callable[[Pose, np.ndarray, Callable[[np.ndarray | None], None]], None]
+
+
+class Place:
+    """Where a model's orientation is kept. folder: of the model; scene: its folder, "" without one."""
+
+    def __init__(self, folder: Path, scene: str, offset: tuple[float, float, float]) -> None:
+        self._folder, self._scene, self.offset = folder, scene, np.array(offset, np.float64)
+        self.record: dict[str, Any] | None = recorded_similarity(str(folder), scene).get(ENTRY)
+
+    @property
+    def unit(self) -> tuple[float, str]:
+        """What a unit of the scene is, and of what."""
+        known = self.record and Similarity.of(self.record, "orientation")
+        return (known.scale, "m") if known and known.metric else (1.0, "units of the scene")
+
+    def write(self, record: dict[str, Any]) -> list[Path]:
+        """Keep a record where convert.py --orient does, and in the model; the files."""
+        written = []
+        if self._scene:
+            written.append(Path(self._scene) / FILE)
+            write_json(written[0], record)
+        if (self._folder / MODEL_JSON).is_file() or not written:
+            add_to_model_json(self._folder, **{ENTRY: record})
+            written.append(self._folder / MODEL_JSON)
+        self.record = record
+        return written
+
+
+class MeasureTab:
+    """Controls for what to click, and points. find: calls back with the place of the surface along a ray, or None.
+
+    place: where to keep what was set, None: nowhere. told: called with the files that were written.
+    """
+
+    def __init__(
+        self,
+        server: "viser.ViserServer",
+        cameras: SceneCameras,
+        find: Find,
+        place: Place | None,
+        told: Callable[[Any, list[Path]], None],
+        tell: Tell,
+    ) -> None:
+        gui, self._server, self._cameras, self._find, self._place = server.gui, server, cameras, find, place
+        self.points: dict[str, list[np.ndarray]] = {tool: [] for tool in _POINTS}
+        self._drawn: list[Any] = []
+        self.tool = gui.add_dropdown("Click", TOOLS)
+        self.says = gui.add_markdown(_SAYS[OFF])
+        hint = "of the length, in metres; 0: not known"
+        self.metres = gui.add_number("True length", 0.0, min=0.0, max=1e6, step=0.01, hint=hint)
+        clear = gui.add_button("Clear", color="gray")
+        self.keep = gui.add_button("Set right", hint="scale, upright and front, for exports", disabled=True)
+        self.tool.on_update(serialized(lambda _: self._choose()))
+        self.metres.on_update(serialized(lambda _: self._show()))
+        clear.on_click(serialized(lambda _: self._clear()))
+        self.keep.on_click(serialized(lambda event: told(event.client, self.write()), tell))
+
+    def _choose(self) -> None:
+        """Listen to clicks while there is something to click."""
+        self._server.scene.remove_click_callback("all")
+        if self.tool.value != OFF:
+            self._server.scene.on_click()(self._clicked)
+        self._show()
+
+    async def _clicked(self, event: Any) -> None:
+        pose, tool = pose_of(event.client.camera), self.tool.value
+        if pose is not None and tool in _POINTS:
+            self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point))
+
+    def add(self, tool: str, point: np.ndarray | None) -> None:
+        """Take a point (3,); a full tool begins anew. None: nothing is there."""
+        if point is None:
+            self.says.content = "There is no surface; click another point."
+            return
+        points = self.points[tool]
+        self.points[tool] = [*points, point] if len(points) < _POINTS[tool] else [point]
+        self._show()
+
+    def _clear(self) -> None:
+        self.points = {tool: [] for tool in _POINTS}
+        self._show()
+
+    def _whole(self, tool: str) -> np.ndarray | None:
+        return np.array(self.points[tool]) if len(self.points[tool]) == _POINTS[tool] else None
+
+    @property
+    def length(self) -> float | None:
+        """Of the two points, in the scene's unit; None without them."""
+        ends = self._whole(LENGTH)
+        return None if ends is None else float(np.linalg.norm(ends[1] - ends[0]))
+
+    def _show(self) -> None:
+        """Draw the points, and say what they measure."""
+        for drawn in self._drawn:
+            drawn.remove()
+        self._drawn, scene, size = [], self._server.scene, self._cameras.size
+        for tool, points in self.points.items():
+            for number, point in enumerate(points):
+                name, look = f"/measured/{tool}/{number}", {"color": _COLOURS[tool], "position": point}
+                self._drawn.append(scene.add_icosphere(name, _SIZE * size, subdivisions=1, **look))
+            if len(points) > 1:
+                ends = np.stack([points, points[1:] + points[:1]], axis=1)[: len(points) if len(points) > 2 else 1]
+                lines = f"/measured/{tool}/lines", ends.astype(np.float32), _COLOURS[tool]
+                self._drawn.append(scene.add_line_segments(*lines, thickness=_WIDTH * size))
+        self.says.content, scale, unit = _SAYS[self.tool.value], *(self._place.unit if self._place else (1.0, "units"))
+        if self.length is not None:
+            said = f"{self.length * scale:.4g} {unit}"
+            self.says.content = f"The length is {said}. {self.says.content}"
+            self._drawn.append(scene.add_label("/measured/length", said, position=np.mean(self.points[LENGTH], axis=0)))
+        if (ground := self._whole(GROUND)) is not None:
+            normal = np.cross(*(ground[1:] - ground[0]))
+            cosine = abs(normal @ self._cameras.up) / max(float(np.linalg.norm(normal)), 1e-12)
+            tilt = math.degrees(math.acos(min(1.0, cosine)))
+            self.says.content = f"The ground is tilted by {tilt:.1f} degrees in the photos. {self.says.content}"
+        known = (self.length or 0) > 0 and self.metres.value > 0
+        whole = known or any(self._whole(tool) is not None for tool in (GROUND, FRONT))
+        self.keep.disabled = self._place is None or not whole
+
+    def write(self) -> list[Path]:
+        """Keep what was measured; the files. UserError for what cannot be kept."""
+        if self._place is None or self.keep.disabled:
+            raise UserError("there is nothing to set right; click the ground, the front, or a length that you know")
+        metres = self.metres.value if math.isfinite(self.metres.value) else 0.0
+        scale = metres / self.length if self.length and metres > 0 else None
+        moved = {tool: None if (it := self._whole(tool)) is None else it + self._place.offset for tool in _POINTS}
+        above = self._cameras.middle + self._place.offset
+        record = measured_record(self._place.record, above, scale, moved[GROUND], moved[FRONT])
+        Similarity.of(record, "what was measured")  # a scale that no scene has
+        files = self._place.write(record)
+        self._show()
+        return files
