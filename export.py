@@ -52,6 +52,7 @@ if TYPE_CHECKING:  # SciPy takes a while to import
     from splatting.camera_paths.poses import Poses
 
 FOR_PHONES = 500_000  # Gaussians of a page
+_DETAILS = "voxel", "triangles", "start", "title", "notes", "walk"  # of `Around`
 
 
 def load(
@@ -208,15 +209,13 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         around = None
         if entry.of_scene:
             cameras = scene.getTrainCameras() if scene else circle(chosen.means)
-            texts = args.start, args.title, args.notes
-            around = Around(cameras, background, pipe, make_path, args.voxel, *texts, args.walk)
+            details = {name: getattr(args, name) for name in _DETAILS}
+            around = Around(cameras, background, pipe, make_path, **details)
         chosen, around = placed(args, entry.of_scene, chosen, around)
         what = entry.write(to, chosen, *((around,) if around else ()))
         print(f"Wrote {to}: {_told(to, entry, what, chosen, splats, args)}, {time.perf_counter() - start:.1f} s")
         if "walk" in entry.options and len(chosen) > FOR_PHONES:
-            print(
-                f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; --max_splats {FOR_PHONES} makes a page for them"
-            )
+            print(f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; make a page for them by --max_splats")
 
 
 def _told(to: str, entry: Format, what: str | None, chosen: Splats, splats: Splats, args: argparse.Namespace) -> str:
@@ -243,7 +242,7 @@ def _check_fitting(args: argparse.Namespace, entries: Sequence[Format]) -> None:
     """UserError for an option that is for files of other kinds, and for a file that is named twice."""
     if twice := [to for place, to in enumerate(args.to) if to in args.to[:place]]:
         raise UserError(f"--to {twice[0]} is given twice; give each file once")
-    for option in ("path", "voxel", "start", "title", "notes", "walk", "raw"):
+    for option in ("path", *_DETAILS, "raw"):
         if getattr(args, option) and not any(option in entry.options for entry in entries):
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
@@ -315,6 +314,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--raw", action="store_true", help="do not --clean an .html (default: cleaned, if its scene is there)")
     add("--voxel", type=float, metavar="UNITS",
         help="size of a mesh's voxels in the scene's unit (default: two pixels at the median depth)")  # fmt: skip
+    add("--triangles", type=int, metavar="N",
+        help="triangles of a mesh, at most (default: all of a mesh.ply, 200000 of one with a texture)")  # fmt: skip
     add_upright_options(add)
     add("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     return parser, model_params, pipeline_params
@@ -335,6 +336,8 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
         raise UserError("--raw and --clean contradict each other; leave one out")
     if args.voxel is not None and not 0 < args.voxel < math.inf:
         raise UserError(f"--voxel must be above 0, got {args.voxel}")
+    if args.triangles is not None and args.triangles < 1:
+        raise UserError(f"--triangles must be 1 or above, got {args.triangles}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):
         raise UserError(f"--crop takes the smaller corner first, x0 y0 z0 x1 y1 z1, got {args.crop}")
     if args.model_path or not args.ply:

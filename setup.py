@@ -48,10 +48,12 @@ setup(
     license="Apache-2.0",
     extras_require={
         "export": [  # .usdz, .spz and meshes
+            "fast-simplification==0.2.0",
             'scikit-image==0.25.2; python_version < "3.11"',
             'scikit-image==0.26.0; python_version >= "3.11"',
             'usd-core==26.8; python_version < "3.11"',
             'usd-core==26.11; python_version >= "3.11"',
+            "xatlas==0.0.11",
             "zstandard==0.25.0",
         ],
         "heic": ["pillow-heif==1.8.1"],  # photos of convert.py

@@ -1,14 +1,16 @@
-"""Meshes: their distance from a known surface, which side is out, what is left out, their files, and refusals."""
+"""Meshes: their distance from a known surface, which side is out, what is left out, textures, files, and refusals."""
 
-import json
-import struct
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from gaussians import pipeline
 from html_scene import CENTRE, cameras
+from PIL import Image
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
@@ -22,9 +24,11 @@ from scene.splats.splats import Splats
 from scene.with_splats import model_of
 from splatting.demo.make_scene import make_scene
 from splatting.exports import mesh
-from splatting.exports.formats import format_of
-from splatting.exports.mesh import Mesh, large_parts, mesh_of, pinholes, volume_of, zero_level
-from splatting.exports.mesh_files import write_glb_mesh, write_ply_mesh
+from splatting.exports.formats import Around, format_of
+from splatting.exports.mesh import Mesh, fewer, mesh_of, vertex_normals, volume_of, zero_level
+from splatting.exports.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims
+from splatting.exports.mesh_files import write_ply_mesh
+from splatting.exports.surfaces import Surfaces, pinholes
 from utils.sh_utils import C0
 from utils.system_utils import UserError
 
@@ -83,23 +87,21 @@ def test_a_mesh_lies_on_the_surface_and_faces_outwards(of_ball):
     away = np.linalg.norm(of_ball.vertices - CENTRE, axis=1)
     # Measured: 0.016 and 0.046; half as much of Gaussians half as large, of which a ray meets the nearest first.
     assert abs(away - RADIUS).mean() < 0.02 and abs(away - RADIUS).max() < 0.06
+    assert ((of_ball.normals * (of_ball.vertices - CENTRE)).sum(axis=1) / away).min() > 0
     a, b, c = (of_ball.vertices[of_ball.faces[:, k]] - CENTRE for k in range(3))
-    volume = (np.cross(a, b) * c).sum() / 6
-    assert 0.8 < volume / (4 / 3 * np.pi * RADIUS**3) < 1.1
+    volume = (np.cross(a, b) * c).sum() / 6  # of cones from the middle: no three views see the lowest part
+    assert 0.6 < volume / (4 / 3 * np.pi * RADIUS**3) < 0.9
     np.testing.assert_allclose(of_ball.colors.mean(axis=0) / 255, [0.9, 0.5, 0.1], atol=0.05)
 
 
 def test_chunks_have_no_seams(ball, views, monkeypatch):
     """Of blocks one by one, the mesh has the same edges with one triangle as of all at once."""
-    volume, open_edges, sizes = volume_of(ball, views, pipeline(), VOXEL), [], []
+    volume, open_edges, sizes = volume_of(Surfaces(ball, views, pipeline()), VOXEL), [], []
     for side in (16, 1):
         monkeypatch.setattr(mesh, "_CHUNK", side)
-        found = zero_level(volume)
-        edges = np.sort(
-            np.concatenate([found.faces[:, [0, 1]], found.faces[:, [1, 2]], found.faces[:, [2, 0]]]), axis=1
-        )
-        open_edges.append((np.unique(edges, axis=0, return_counts=True)[1] == 1).sum())
-        sizes.append((len(found.vertices), len(found.faces)))
+        vertices, faces, _ = zero_level(volume, 3)
+        open_edges.append(len(rim_edges(faces, len(vertices))))
+        sizes.append((len(vertices), len(faces)))
     assert open_edges[0] == open_edges[1] and sizes[0] == sizes[1]
 
 
@@ -114,11 +116,48 @@ def test_small_parts_are_left_out_and_large_ones_kept():
         parts.append(points)
         faces.append(triangles + start)
         start += len(points)
-    vertices = np.concatenate(parts)
-    some = Mesh(vertices, np.concatenate(faces).astype(np.int32), np.zeros(vertices.shape, np.uint8))
-    kept = large_parts(some)
-    assert sorted(set(kept.vertices[:, 2])) == [0.0, 3.0] and len(kept.faces) == 4004
-    assert kept.faces.max() == len(kept.vertices) - 1
+    vertices, faces = np.concatenate(parts), np.concatenate(faces).astype(np.int32)
+    weights = np.where(vertices[:, 2] == 3, 30, 1)  # which has more pixels in photos than its triangles tell
+    kept, left = large_parts(vertices, faces, weights)
+    assert sorted(set(kept[:, 2])) == [0.0, 3.0] and len(left) == 4004
+    assert left.max() == len(kept) - 1
+
+
+def grid(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """A square of unit squares, with a tongue as wide as one at its side."""
+    places = np.array([(x, y) for x in range(size + 1) for y in range(size + 1)])
+    squares = np.array([(x, y) for x in range(size) for y in range(size) if y < size // 2 or x == size // 2])
+    corners = [squares @ [size + 1, 1] + step for step in (0, size + 1, size + 2, 1)]
+    faces = np.concatenate([np.stack([corners[k] for k in row], 1) for row in ((0, 1, 2), (0, 2, 3))])
+    return np.column_stack([places, np.zeros(len(places))]).astype(np.float32), faces.astype(np.int32)
+
+
+def test_rims_lose_their_tongues_and_become_smooth():
+    vertices, faces = grid(20)
+    kept = broad(faces, len(vertices))
+    # The tongue may leave a stub, and corners become round.
+    assert vertices[kept][..., 1].max() < 13 < vertices[faces][..., 1].max() and len(kept) > 0.9 * 2 * 200
+    jagged = vertices.copy()
+    jagged[:, 1] += np.where((vertices[:, 1] == 0) & (vertices[:, 0] % 2 == 0), 0.4, 0)
+    smooth = smooth_rims(jagged, faces)
+    assert np.ptp(smooth[(vertices[:, 1] == 0) & (abs(vertices[:, 0] - 10) < 8), 1]) < 0.05
+    inner = np.setdiff1d(faces, rim_edges(faces, len(vertices)))
+    np.testing.assert_array_equal(smooth[inner], jagged[inner])
+
+
+def test_a_surface_needs_the_views_that_it_is_asked_for(ball, views):
+    volume = volume_of(Surfaces(ball, views[:2], pipeline()), VOXEL)
+    assert len(zero_level(volume, 2)[1]) > 100
+    with pytest.raises(UserError, match="the training views show no surface"):
+        zero_level(volume, 3)
+
+
+def test_fewer_triangles_lie_on_the_same_surface(of_ball):
+    vertices, faces = fewer(of_ball.vertices, of_ball.faces, 500)
+    away = vertices - CENTRE
+    distances = np.linalg.norm(away, axis=1)
+    assert 400 < len(faces) <= 500 and abs(distances - RADIUS).mean() < 0.02
+    assert ((vertex_normals(vertices, faces) * away).sum(axis=1) / distances).min() > 0.8
 
 
 def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
@@ -133,33 +172,91 @@ def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
         torch.testing.assert_close(view.world_view_transform, camera.world_view_transform, rtol=0, atol=1e-5)
 
 
-def test_files_hold_the_mesh(tmp_path, ball, of_ball):
+def test_a_ply_holds_the_mesh(tmp_path, ball, of_ball):
     write_ply_mesh(tmp_path / "mesh.ply", of_ball, ball)
     read = PlyData.read(tmp_path / "mesh.ply")
     np.testing.assert_array_equal(np.column_stack([read["vertex"][name] for name in "xyz"]), of_ball.vertices)
     np.testing.assert_array_equal(np.vstack(read["face"]["vertex_indices"]), of_ball.faces)
     np.testing.assert_array_equal(read["vertex"]["green"], of_ball.colors[:, 1])
-    write_glb_mesh(tmp_path / "mesh.glb", of_ball, ball)
-    content = (tmp_path / "mesh.glb").read_bytes()
-    assert struct.unpack_from("<4sII", content) == (b"glTF", 2, len(content))
-    (length,) = struct.unpack_from("<I", content, 12)
-    document, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
-    assert [entry["count"] for entry in document["accessors"]] == [*[len(of_ball.vertices)] * 2, of_ball.faces.size]
-    place = document["bufferViews"][2]
-    indices = np.frombuffer(binary, "<u4", place["byteLength"] // 4, place["byteOffset"])
-    np.testing.assert_array_equal(indices.reshape(-1, 3), of_ball.faces)
+    np.testing.assert_array_equal(read["vertex"]["nz"], of_ball.normals[:, 2])
+
+
+@pytest.fixture(scope="module")
+def of_two_halves(ball, views) -> Mesh:
+    """A mesh with a texture, of a ball that is green on one side and red on the other."""
+    sh = np.where(ball.means[:, None, None, 0] > CENTRE[0], np.array([0.1, 0.7, 0.1]), np.array([0.7, 0.1, 0.1]))
+    halves = replace(ball, sh=((sh.reshape(-1, 1, 3) - 0.5) / C0).astype(np.float32))
+    return mesh_of(halves, views, pipeline(), VOXEL, 1000, True)[0]
+
+
+def read_usdz(path: Path) -> tuple[np.ndarray, ...]:
+    """Vertices, faces, normals, places in the texture from its lower left corner, and the texture."""
+    from pxr import Usd, UsdGeom, UsdShade
+
+    stage = Usd.Stage.Open(str(path))
+    (prim,) = (prim for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh))
+    shape, turn = UsdGeom.Mesh(prim), np.array(UsdGeom.XformCache().GetLocalToWorldTransform(prim))[:3, :3]
+    material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+    texture = UsdShade.Shader(material.ComputeSurfaceSource()[0].GetInput("emissiveColor").GetConnectedSource()[0])
+    name = texture.GetInput("file").Get().resolvedPath.split("[")[1].rstrip("]")
+    with zipfile.ZipFile(path) as package, package.open(name) as file:
+        picture = np.asarray(Image.open(file))
+    points, normals = (np.array(x.Get()) @ turn for x in (shape.GetPointsAttr(), shape.GetNormalsAttr()))
+    faces, uv = shape.GetFaceVertexIndicesAttr().Get(), UsdGeom.PrimvarsAPI(prim).GetPrimvar("st").Get()
+    return points, np.array(faces).reshape(-1, 3), normals, np.array(uv), picture
+
+
+def read_by_trimesh(path: Path) -> tuple[np.ndarray, ...]:
+    scene = trimesh.load_scene(path, process=False)
+    (node,) = scene.graph.nodes_geometry
+    matrix, name = scene.graph[node]
+    found, turn = scene.geometry[name], matrix[:3, :3].T
+    material = found.visual.material
+    image = material.image if path.suffix == ".obj" else material.baseColorTexture
+    return found.vertices @ turn, found.faces, found.vertex_normals @ turn, found.visual.uv, np.asarray(image)
+
+
+@pytest.mark.parametrize("ending", ["glb", "obj", "usdz"])
+def test_other_programs_read_meshes_with_their_textures(tmp_path, monkeypatch, ending, ball, of_two_halves):
+    monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (of_two_halves, ""))
+    path = tmp_path / f"a ball.mesh.{ending}"
+    entry = format_of(path)
+    for _ in range(2):  # its own files are not in its way
+        entry.check(path)
+        entry.write(path, ball, Around((), (0, 0, 0), pipeline()))
+    points, faces, normals, uv, texture = (read_usdz if ending == "usdz" else read_by_trimesh)(path)
+    turn = [1, -1, -1]  # y up
+    corners = of_two_halves.vertices[of_two_halves.faces] * turn
+    np.testing.assert_allclose(points[faces], corners, atol=1e-5)
+    np.testing.assert_allclose(normals[faces], (of_two_halves.normals * turn)[of_two_halves.faces], atol=1e-3)
+    away = points - CENTRE * turn
+    assert ((normals * away).sum(axis=1) > 0).all()
+    columns, rows = (uv * [1, -1] + [0, 1]).T * np.array(texture.shape[1::-1])[:, None]
+    colors = texture[rows.astype(int).clip(0, len(texture) - 1), columns.astype(int).clip(0, texture.shape[1] - 1), :3]
+    for side, expected in ((away[:, 0] > 0.15, [26, 179, 26]), (away[:, 0] < -0.15, [179, 26, 26])):
+        assert side.sum() > 100 and np.quantile(abs(colors[side] - np.float32(expected)), 0.98) < 20
+
+
+def test_an_obj_spares_foreign_files_beside_it(tmp_path):
+    for ending in ("png", "mtl"):
+        other = tmp_path / f"a.mesh.{ending}"
+        other.write_text("mine")
+        with pytest.raises(UserError, match=rf"no export wrote .*a.mesh.{ending}"):
+            format_of("a.mesh.obj").check(tmp_path / "a.mesh.obj")
+        other.unlink()
 
 
 def test_too_small_voxels_are_refused_or_enlarged(ball, views, monkeypatch):
     monkeypatch.setattr(mesh, "MOST_VOXELS", 60_000)
+    some = Surfaces(ball, views[:4], pipeline())
     with pytest.raises(UserError, match=r"--voxel 0.04 makes more than 0 million voxels.*; give .* or more") as refused:
-        volume_of(ball, views[:4], pipeline(), 0.04)
-    volume_of(ball, views[:4], pipeline(), float(str(refused.value).split()[-3]))
+        volume_of(some, 0.04)
+    volume_of(some, float(str(refused.value).split()[-3]))
     for voxel in (1e-3, 1e-300):
         with pytest.raises(UserError, match=rf"--voxel {voxel:g} is far below a pixel, .*; give .* or more") as refused:
-            volume_of(ball, views[:4], pipeline(), voxel)
+            volume_of(some, voxel)
         assert 0.05 < float(str(refused.value).split()[-3]) < 0.5
-    volume = volume_of(ball, views[:4], pipeline())
+    volume = volume_of(some)
     assert len(volume.keys) * 512 <= 60_000
 
 
@@ -184,13 +281,14 @@ def trained(tmp_path_factory) -> Path:
 
 @pytest.mark.slow
 def test_the_mesh_of_a_traced_scene_lies_on_its_surfaces(trained, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["mesh", "-m", str(trained), "--voxels", "0.08"])
+    monkeypatch.setattr("sys.argv", ["mesh", "-m", str(trained), "--voxel", "0.08", "--triangles", "9000"])
     benchmark.main()
-    large, every = (line.split("|")[3:-1] for line in capsys.readouterr().out.splitlines()[-2:])
-    assert int(large[0].replace(",", "")) <= int(every[0].replace(",", ""))
-    accuracy, _, completeness, *_ = map(float, every[1:])
+    every, clean, few = (line.split("|")[2:-1] for line in capsys.readouterr().out.splitlines()[-3:])
+    assert int(few[0].replace(",", "")) <= 9000 < int(every[0].replace(",", ""))
+    accuracy, _, completeness, *_ = map(float, every[1:6])
     # Measured: 0.046 and 0.080; cameras are 3.6 away.
     assert accuracy < 0.06 and completeness < 0.1
+    assert float(few[6].split(",")[1]) > 20  # dB
 
 
 @pytest.mark.slow
@@ -202,7 +300,12 @@ def test_export_writes_meshes(trained, monkeypatch, tmp_path, capsys):
         export.main()
         assert "triangles, " in capsys.readouterr().out and (tmp_path / name).stat().st_size > 10_000
     for words, said in (
-        (["--to", "a.ply", "--voxel", "0.1"], "--voxel is for mesh.ply or mesh.glb; leave it out"),
+        (
+            ["--to", "a.ply", "--voxel", "0.1"],
+            "--voxel is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz; leave it out",
+        ),
+        (["--to", "a.ply", "--triangles", "9"], "--triangles is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz"),
+        (["--to", "mesh.ply", "--triangles", "0"], "--triangles must be 1 or above, got 0"),
         (["--to", "mesh.ply", "--path", "spiral"], "--path is for .html; leave it out"),
         (["--to", "mesh.ply", "--voxel", "0"], "--voxel must be above 0, got 0.0"),
     ):
@@ -212,5 +315,5 @@ def test_export_writes_meshes(trained, monkeypatch, tmp_path, capsys):
 
 
 def test_meshes_have_names_of_their_own():
-    assert format_of("out/mesh.ply").options == format_of("room.MESH.glb").options == ("voxel",)
+    assert format_of("out/mesh.ply").options == format_of("room.MESH.glb").options == ("voxel", "triangles")
     assert format_of("out/meshes.ply").options == ()

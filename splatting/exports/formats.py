@@ -17,7 +17,16 @@ from scene.splats.ply import write_compressed_ply, write_plain_ply
 from scene.splats.splats import Splats
 from scene.splats.spz import find_zstandard, write_spz
 from splatting.camera_paths.poses import poses_of
-from splatting.exports.mesh_files import find_skimage, with_z_up, write_glb_mesh, write_ply_mesh
+from splatting.exports.mesh_files import (
+    check_obj_mesh,
+    check_usdz_mesh,
+    find_packages,
+    with_z_up,
+    write_glb_mesh,
+    write_obj_mesh,
+    write_ply_mesh,
+    write_usdz_mesh,
+)
 from splatting.exports.scene_formats import find_pxr, write_glb, write_usdz
 from splatting.exports.sog import find_splat_transform, write_sog
 from splatting.files.ours import refuse_foreign
@@ -43,6 +52,7 @@ class Around(NamedTuple):
     walk: bool = False  # of a page: guests can walk
     upright: bool = False  # whether -y of all of these is up, so that a page need not find it
     metric: bool = False  # whether the unit is known to be a metre
+    triangles: int | None = None  # of a mesh, at most
 
 
 @dataclass(frozen=True)
@@ -96,19 +106,24 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
-def _mesh_by(
-    write: Callable[[str | os.PathLike, Mesh, Splats], None], turn: Callable[[Mesh], Mesh] | None = None
-) -> Callable[..., str]:
-    """What writes meshes. turn: of a mesh that is upright, before."""
+def _mesh(
+    ending: str,
+    write: Callable[[str | os.PathLike, Mesh, Splats], None],
+    what: str,
+    check: Callable[[str | os.PathLike], None] = find_packages,
+    with_texture: bool = True,
+) -> Format:
+    """A format of meshes, with a texture or with colours of vertices."""
 
     def write_mesh(path: str | os.PathLike, splats: Splats, around: Around) -> str:
         from splatting.exports.mesh import mesh_of  # as does this
 
-        mesh, text = mesh_of(splats, around.cameras, around.pipe, around.voxel)
-        write(path, turn(mesh) if turn and around.upright else mesh, splats)
+        how = around.pipe, around.voxel, around.triangles, with_texture
+        mesh, text = mesh_of(splats, around.cameras, *how)
+        write(path, with_z_up(mesh) if around.upright and not with_texture else mesh, splats)
         return text
 
-    return write_mesh
+    return Format(ending, write_mesh, what, True, ("voxel", "triangles"), bands=False, check=check)
 
 
 def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around, compressed: bool = False) -> str:
@@ -125,18 +140,10 @@ def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: Around) -> 
 
 # An ending that ends with another one comes before it.
 FORMATS = (
-    Format(
-        "mesh.ply",
-        _mesh_by(write_ply_mesh, with_z_up),
-        "surfaces, as coloured triangles",
-        True,
-        ("voxel",),
-        bands=False,
-        check=find_skimage,
-    ),
-    Format(
-        "mesh.glb", _mesh_by(write_glb_mesh), "the same, as glTF", True, ("voxel",), bands=False, check=find_skimage
-    ),
+    _mesh("mesh.ply", write_ply_mesh, "surfaces, as coloured triangles", with_texture=False),
+    _mesh("mesh.glb", write_glb_mesh, "surfaces with a texture, as glTF"),
+    _mesh("mesh.obj", write_obj_mesh, "the same, with .mtl and .png beside it", check_obj_mesh),
+    _mesh("mesh.usdz", write_usdz_mesh, "the same, as OpenUSD", check_usdz_mesh),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept", in_order=True),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),

@@ -1,7 +1,8 @@
 """A mesh of a model's surfaces: depths of the training views, fused to signed distances, and their zero level.
 
-The zero level is that of marching cubes (Lewiner et al. 2003), where all corners of a cube are known: what no view
-shows stays open. Connected parts much smaller than the largest one are left out, which are mostly of floaters.
+The zero level is that of marching cubes (Lewiner et al. 2003), where several views confirm all corners of a cube: what
+they do not show stays open. It is cleaned (splatting/exports/mesh_cleaning.py), and made of fewer triangles by quadric
+error (Garland and Heckbert 1997).
 """
 
 import argparse
@@ -9,141 +10,117 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from gaussian_renderer.free_view import free_view
-from gaussian_renderer.median_depth import surface_of
-from scene.cameras import Camera, MiniCam
-from scene.gaussian_model import GaussianModel
+from scene.cameras import Camera
 from scene.splats.splats import Splats
-from scene.with_splats import model_of
-from splatting.camera_paths.poses import keyframe, opening, poses_of
+from splatting.exports.mesh_cleaning import area_vectors, smooth_rims, whole_parts
+from splatting.exports.mesh_colors import point_colors
+from splatting.exports.surfaces import Surfaces
+from splatting.exports.texture import textured
 from splatting.exports.tsdf import BYTES, SIDE, TooManyBlocks, Volume
-from splatting.host.progress import Bar
 from utils.system_utils import UserError
 
 MOST_VOXELS = 100_000_000
+CONFIRMED = 3  # views that a surface needs
+TRIANGLES = 200_000  # of a mesh with a texture, unless the user wants another number
 _PIXELS = 2.0  # default size of a voxel, in pixels at the median depth
-_FAR = 4.0  # median depths beyond which surfaces are left out
-_TRIED = 16  # views that the median depth is of
 _COARSER = 1.5
-_SMALL = 0.001
 _CHUNK = 16  # blocks of a cube that marching cubes takes at once
 _NOT_ZERO = 1e-3  # a distance of zero would put several edges' points at one corner
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """vertices (V, 3) float32 in the frame of the splats; faces (F, 3) int32; colors (V, 3) uint8.
+    """vertices (V, 3) float32 in the frame of the splats; faces (F, 3) int32; normals (V, 3) float32, of unit length.
 
-    Faces are counter-clockwise where they are seen from.
+    Faces are counter-clockwise where they are seen from. It has colors (V, 3) uint8, or a texture (H, W, 3) uint8 and
+    places in it, uv (V, 2) float32 from the image's upper left corner, 0 to 1.
     """
 
     vertices: np.ndarray
     faces: np.ndarray
-    colors: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray | None = None
+    uv: np.ndarray | None = None
+    texture: np.ndarray | None = None
 
 
 def mesh_of(
-    splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace, voxel: float | None = None
+    splats: Splats,
+    cameras: Sequence[Camera],
+    pipe: argparse.Namespace,
+    voxel: float | None = None,
+    triangles: int | None = None,
+    with_texture: bool = False,
 ) -> tuple[Mesh, str]:
-    """The large parts of the mesh of splats, and a part of a sentence about it. Arguments as for `volume_of`."""
-    volume = volume_of(splats, cameras, pipe, voxel)
-    mesh = large_parts(zero_level(volume))
-    counts = f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
-    return mesh, f"{counts}, {len(volume.keys) * SIDE**3 * BYTES / 1e9:.2f} GB of voxels of {volume.voxel:.3g}"
+    """The clean mesh of splats, and a part of a sentence about it. UserError as for `Surfaces` and `volume_of`.
+
+    triangles: at most. None: TRIANGLES of a mesh with a texture, and all of one with colours.
+    """
+    surfaces = Surfaces(splats, cameras, pipe)
+    volume = volume_of(surfaces, voxel)
+    vertices, every = whole_parts(*zero_level(volume, min(CONFIRMED, len(surfaces.views))))
+    vertices, faces = fewer(
+        smooth_rims(vertices, every), every, triangles or (TRIANGLES if with_texture else len(every))
+    )
+    normals = vertex_normals(vertices, faces)
+    if with_texture:
+        mesh = Mesh(*textured(vertices, faces, normals, surfaces, volume.voxel))
+        look = f"a texture of {mesh.texture.shape[1]} x {mesh.texture.shape[0]} pixels, "
+    else:
+        colors = point_colors(vertices, normals, surfaces, volume.voxel)
+        mesh, look = Mesh(vertices, faces, normals, colors), ""
+    counts = f"{len(vertices):,} vertices, {len(faces):,} of {len(every):,} triangles"
+    return mesh, f"{counts}, {look}{len(volume.keys) * SIDE**3 * BYTES / 1e9:.2f} GB of voxels of {volume.voxel:.3g}"
 
 
-def volume_of(
-    splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace, voxel: float | None = None
-) -> Volume:
-    """Distances from the surfaces that cameras see.
+def volume_of(surfaces: Surfaces, voxel: float | None = None) -> Volume:
+    """Distances from surfaces.
 
     voxel: its size in the world's unit. None: two pixels at the median depth, or larger where the voxels would be more
-    than MOST_VOXELS. UserError if a given size makes more or is far below a pixel, and if no camera sees a surface.
+    than MOST_VOXELS. UserError if a given size makes more or is far below a pixel.
     """
-    gaussians = model_of(splats)
-    pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": splats.antialiasing}))
-    views = pinholes(cameras)
-    if not views:
-        raise UserError("a mesh needs training cameras, from which it sees the surfaces; the scene has none")
-    tried = views[:: -(-len(views) // _TRIED)]
-    spans = [_spans(view, surface_of(view, gaussians, pipe).depth) for view in tried]
-    if not any(spans):
-        raise UserError("a mesh needs surfaces, and no training view shows anything opaque; train for longer")
-    depth, pixel = np.median([span for span in spans if span], axis=0).tolist()
+    pixel = surfaces.pixel
     small = voxel is not None and SIDE * voxel < pixel  # blocks around the surface in neighbouring pixels do not touch
     size = _PIXELS * pixel if voxel is None or small else voxel
-    volume = _empty_volume(gaussians, views, pipe, size, _FAR * depth, coarser=voxel is None or small)
+    volume = _empty_volume(surfaces, size, coarser=voxel is None or small)
     if small:
         usual = f"which is {pixel:.2g} at the usual depth"
         raise UserError(f"--voxel {voxel:g} is far below a pixel, {usual}; give {volume.voxel:.2g} or more")
-    for view in Bar(views, desc="Fusing depths", unit="view"):
-        surface = surface_of(view, gaussians, pipe)
-        volume.add_view(view, _within(surface.depth, _FAR * depth), surface.color)
+    for view, surface in surfaces.each("Fusing depths"):
+        volume.add_view(view, surface.depth)
     return volume
 
 
-def pinholes(cameras: Sequence[Camera]) -> list[Camera | MiniCam]:
-    """The views, and in the places of those with lenses views without, as wide as these are high, or 60 degrees."""
-    views = []
-    for camera, poses in ((camera, poses_of([camera])) for camera in cameras):
-        if getattr(camera, "lens", None) is not None:
-            pose = keyframe(0.0, poses.positions[0], poses.turns[0], 0.0)
-            size = camera.image_width, camera.image_height
-            camera = free_view(*size, opening(camera), pose.position, pose.wxyz, camera.device)
-        views.append(camera)
-    return views
-
-
-def _spans(view: Camera | MiniCam, depth: Tensor) -> tuple[float, float] | None:
-    """The median depth of a view, and the height of a pixel there; None of an empty one."""
-    known = depth[depth > 0]
-    if not len(known):
-        return None
-    median = float(known.median())
-    return median, median * 2 * float(np.tan(view.FoVy / 2)) / view.image_height
-
-
-def _within(depth: Tensor, far: float) -> Tensor:
-    return torch.where(depth < far, depth, 0)
-
-
-def _empty_volume(
-    gaussians: GaussianModel,
-    views: Sequence[Camera | MiniCam],
-    pipe: argparse.Namespace,
-    voxel: float,
-    far: float,
-    coarser: bool,
-) -> Volume:
-    """The blocks of all surfaces nearer than `far`, empty. coarser: of a larger voxel, where they would be too many."""
+def _empty_volume(surfaces: Surfaces, voxel: float, coarser: bool) -> Volume:
+    """The blocks of all surfaces, empty. coarser: of a larger voxel, where they would be too many."""
     given = voxel
     while True:
-        volume = Volume(voxel, gaussians.get_xyz.device)
+        volume = Volume(voxel, surfaces.device)
         try:
-            for view in Bar(views, desc="Finding surfaces", unit="view"):
-                depth = _within(surface_of(view, gaussians, pipe).depth, far)
-                volume.add_blocks(view, depth, MOST_VOXELS // SIDE**3)
+            for view, surface in surfaces.each("Finding surfaces"):
+                volume.add_blocks(view, surface.depth, MOST_VOXELS // SIDE**3)
         except TooManyBlocks:
             voxel = float(f"{_COARSER * voxel:.2g}")  # as a user would type it
             continue
         if voxel > given and not coarser:
             raise UserError(
                 f"--voxel {given:g} makes more than {MOST_VOXELS / 1e6:.0f} million voxels of "
-                f"{BYTES * MOST_VOXELS / 1e9:.0f} GB; give {voxel:g} or more"
+                f"{BYTES * MOST_VOXELS / 1e9:.1f} GB; give {voxel:g} or more"
             )
         volume.start()
         return volume
 
 
-def zero_level(volume: Volume) -> Mesh:
-    """All surfaces of a volume. UserError if there are none."""
+def zero_level(volume: Volume, confirmed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Vertices and faces, as of `Mesh`, of the surfaces that `confirmed` views see. UserError if there are none.
+
+    Also the weights (V,) of the vertices, as of the volume.
+    """
     from skimage.measure import marching_cubes
 
-    parts, faces, colors, keys, count = [], [], [], [], 0
-    for origin, distances, tints, known in volume.chunks(_CHUNK):
+    parts, faces, keys, weights, count = [], [], [], [], 0
+    for origin, distances, known, sums in volume.chunks(_CHUNK, confirmed):
         cubes = np.zeros_like(known)  # at a cube's last corner
         inner = known[:-1] & known[1:]
         inner = inner[:, :-1] & inner[:, 1:]
@@ -157,16 +134,15 @@ def zero_level(volume: Volume) -> Mesh:
             continue
         keys.append(_edges(places, origin))
         faces.append(triangles.astype(np.int64) + count)
-        colors.append(_interpolated(tints, places))
+        weights.append(sums[tuple(places.astype(int).T)])
         parts.append((places + origin.astype(np.float64)) * volume.voxel)
         count += len(places)
     if not count:
         raise UserError("the training views show no surface; give a smaller --voxel, or train for longer")
     # Cubes beside each other have the same points on their common side.
     _, first, same = np.unique(np.concatenate(keys), axis=0, return_index=True, return_inverse=True)
-    tints = np.floor(255 * np.concatenate(colors)[first] + 0.5).astype(np.uint8)
     vertices = np.concatenate(parts)[first].astype(np.float32)
-    return Mesh(vertices, same.reshape(-1)[np.concatenate(faces)].astype(np.int32), tints)
+    return vertices, same.reshape(-1)[np.concatenate(faces)].astype(np.int32), np.concatenate(weights)[first]
 
 
 def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
@@ -179,25 +155,19 @@ def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
     return np.column_stack([lower + origin, axis])
 
 
-def _interpolated(colors: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Colours (V, 3) between the ends of each point's edge."""
-    low, high = np.floor(places).astype(int), np.ceil(places).astype(int)
-    share = (places - low).max(axis=1, keepdims=True)
-    return (1 - share) * colors[tuple(low.T)] + share * colors[tuple(high.T)]
+def fewer(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same surface of `triangles`, or of all if they are no more."""
+    if len(faces) <= triangles:
+        return vertices, faces
+    from fast_simplification import simplify
+
+    vertices, faces = simplify(vertices, faces, target_count=triangles)
+    return vertices.astype(np.float32), faces.astype(np.int32)
 
 
-def large_parts(mesh: Mesh) -> Mesh:
-    """The connected parts of which each has at least a share _SMALL of the triangles of the largest one.
-
-    The largest one alone would often lack the subject: photos hardly show where it stands on the floor.
-    """
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-
-    count, (a, b, c) = len(mesh.vertices), mesh.faces.T
-    edges = np.concatenate([a, b]), np.concatenate([b, c])
-    _, part = connected_components(coo_matrix((np.ones(len(edges[0]), bool), edges), (count, count)), directed=False)
-    sizes = np.bincount(part[a])
-    faces = mesh.faces[sizes[part[a]] >= _SMALL * sizes.max()]
-    used, faces = np.unique(faces, return_inverse=True)
-    return Mesh(mesh.vertices[used], faces.reshape(-1, 3).astype(np.int32), mesh.colors[used])
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(V, 3) float32, of unit length: means of those of the faces around, by their areas."""
+    vectors = area_vectors(vertices, faces)
+    sums = [np.bincount(faces.ravel(), np.repeat(values, 3), len(vertices)) for values in vectors.T]
+    normals = np.stack(sums, axis=1)
+    return (normals / np.linalg.norm(normals, axis=1, keepdims=True).clip(1e-30)).astype(np.float32)

@@ -15,9 +15,10 @@ import json
 import os
 import struct
 import zipfile
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -165,11 +166,24 @@ def _accessor(index: int, name: str, values: np.ndarray) -> dict:
 
 def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
     """Write a USDZ file, whole or not at all. UserError without a usd-core that has the schema."""
+    write_usd_package(path, lambda usd, stage, _: _add_splats(usd, stage, splats))
+
+
+def write_usd_package(path: str | os.PathLike, fill: Callable[[ModuleType, Any, Path], None]) -> None:
+    """Write a USDZ file, whole or not at all. UserError without usd-core.
+
+    fill: takes pxr, a stage with y up, in metres and with the prim /World, and a folder for files that it refers to.
+    """
     usd = find_pxr(path)
     with temporary_folder() as folder, atomic_write(path) as temporary:
-        layer = folder / "splats.usdc"
+        layer = folder / "model.usdc"
         try:
-            _write_stage(usd, str(layer), splats)
+            stage = usd.Usd.Stage.CreateNew(str(layer))
+            usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
+            usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+            stage.SetDefaultPrim(usd.UsdGeom.Xform.Define(stage, "/World").GetPrim())
+            fill(usd, stage, folder)
+            stage.GetRootLayer().Save()
             done = usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(layer)), str(temporary))
         except usd.Tf.ErrorException:
             done = False
@@ -182,14 +196,16 @@ def write_usdz(path: str | os.PathLike, splats: Splats) -> None:
 
 
 def _forget_time(package: Path) -> None:
-    """Give the one part of a package the first date that ZIP has, so that the same model has the same bytes."""
+    """Give the parts of a package the first date that ZIP has, so that the same model has the same bytes."""
     with zipfile.ZipFile(package) as archive:
-        (part,) = archive.infolist()
-        places = part.header_offset + 10, archive.start_dir + 12  # in the part's header, and in the directory
+        parts, place = archive.infolist(), archive.start_dir
     with open(package, "r+b") as file:
-        for place in places:
-            file.seek(place)
-            file.write(b"\0\0\x21\0")  # midnight, 1 January 1980
+        for part in parts:
+            for start in (part.header_offset + 10, place + 12):  # in the part's header, and in the directory
+                file.seek(start)
+                file.write(b"\0\0\x21\0")  # midnight, 1 January 1980
+            file.seek(place + 28)
+            place += 46 + sum(struct.unpack("<3H", file.read(6)))
 
 
 def _is_whole(package: Path) -> bool:
@@ -205,7 +221,7 @@ def find_pxr(path: str | os.PathLike) -> ModuleType:
     """The package that a file of this name needs. UserError without it."""
     try:
         import pxr
-        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils, UsdVol, Vt  # noqa: F401  (so that pxr has them)
+        from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdVol, Vt  # noqa: F401  (so that pxr has them)
 
         UsdVol.ParticleField3DGaussianSplat  # noqa: B018
     except (ImportError, AttributeError) as error:
@@ -214,11 +230,7 @@ def find_pxr(path: str | os.PathLike) -> ModuleType:
     return pxr
 
 
-def _write_stage(usd: ModuleType, layer: str, splats: Splats) -> None:
-    stage = usd.Usd.Stage.CreateNew(layer)
-    usd.UsdGeom.SetStageUpAxis(stage, usd.UsdGeom.Tokens.y)
-    usd.UsdGeom.SetStageMetersPerUnit(stage, 1.0)
-    stage.SetDefaultPrim(usd.UsdGeom.Xform.Define(stage, "/World").GetPrim())
+def _add_splats(usd: ModuleType, stage: Any, splats: Splats) -> None:
     field = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, PRIM)
     usd.UsdGeom.Xformable(field).AddRotateXOp().Set(180.0)
     field.GetPrim().SetCustomDataByKey("antialiasing", bool(splats.antialiasing))
@@ -241,4 +253,3 @@ def _write_stage(usd: ModuleType, layer: str, splats: Splats) -> None:
         reach = 3 * np.exp(splats.log_scales.max(axis=1, keepdims=True))
         bounds[:] = (splats.means - reach).min(axis=0), (splats.means + reach).max(axis=0)
     field.GetPrim().GetAttribute("extent").Set(vt.Vec3fArray.FromNumpy(bounds))
-    stage.GetRootLayer().Save()

@@ -2,6 +2,7 @@
 
 Each voxel has the mean, over the views that see it, of its distance along the view's axis from the depth there, cut off
 at TRUNCATION voxels (Curless and Levoy 1996, "A volumetric method for building complex models from range images").
+Views count by the pixels that they have for a voxel there.
 """
 
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from scene.cameras import Camera, MiniCam
 
 SIDE = 8  # voxels of a block's edge
 TRUNCATION = 4.0  # voxels
-BYTES = 20  # of a voxel: distance, weight and colour
+BYTES = 10  # of a voxel: distance, weight and number of views
 _AT_ONCE = 4096  # blocks that a view is added to
 _BITS, _OFFSET = 21, 1 << 20  # of a block's coordinate in its key
 _MEMBERS = torch.tensor(list(product(range(SIDE), repeat=3)))
@@ -60,10 +61,10 @@ class Volume:
         shape = len(self.keys), SIDE**3
         self.distances = torch.zeros(shape, device=self.keys.device)  # sums over the views, as are the others
         self.weights = torch.zeros(shape, device=self.keys.device)
-        self.colors = torch.zeros(*shape, 3, device=self.keys.device)
+        self.views = torch.zeros(shape, dtype=torch.int16, device=self.keys.device)
 
-    def add_view(self, camera: Camera | MiniCam, depth: Tensor, color: Tensor) -> None:
-        """Add what a view says: depth (H, W), 0: unknown; color (3, H, W)."""
+    def add_view(self, camera: Camera | MiniCam, depth: Tensor) -> None:
+        """Add what a view says: depth (H, W), 0: unknown."""
         members = _MEMBERS.to(self.keys.device)
         for rows in torch.arange(len(self.keys), device=self.keys.device).split(_AT_ONCE):
             rows = rows[self._in_view(camera, rows)]
@@ -72,11 +73,10 @@ class Volume:
             seen = depth.flatten()[at.clamp_min(0)]
             away = (seen - axial) / (TRUNCATION * self.voxel)
             counts = (at >= 0) & (seen > 0) & (away > -1)
-            values = torch.where(counts, away.clamp(max=1), 0).view(-1, SIDE**3)
-            self.distances[rows] += values
-            self.weights[rows] += counts.view(-1, SIDE**3)
-            shown = color.flatten(1)[:, at.clamp_min(0)].T * counts[:, None]
-            self.colors[rows] += shown.view(-1, SIDE**3, 3)
+            weights = torch.where(counts, (camera.image_height * self.voxel / axial).square(), 0)
+            self.distances[rows] += (weights * away.clamp(max=1)).view(-1, SIDE**3)
+            self.weights[rows] += weights.view(-1, SIDE**3)
+            self.views[rows] += counts.view(-1, SIDE**3)
 
     def _in_view(self, camera: Camera | MiniCam, rows: Tensor) -> Tensor:
         """(R,) bool: blocks that reach into a view's pyramid, with some margin."""
@@ -86,10 +86,12 @@ class Volume:
         steep = camera.full_proj_transform[:3].norm(dim=0)  # by how much a step of one unit changes each at most
         return (clip[:, :2].abs() < clip[:, 3:] + radius * (steep[:2] + steep[3])).all(1)
 
-    def chunks(self, side: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-        """Cubes of `side` blocks and one voxel more: origin (3,) in voxels, distances, colours, and what is known.
+    def chunks(self, side: int, confirmed: int) -> Iterator[tuple[np.ndarray, ...]]:
+        """Cubes of `side` blocks and one voxel more: origin (3,) in voxels, distances, what is known, and weights.
 
-        The arrays are dense, (S, S, S), and (S, S, S, 3) for colours in [0, 1].
+        The last three are dense.
+
+        Known are voxels that at least `confirmed` views have counted.
         """
         blocks = _blocks(self.keys)
         for chunk in torch.unique(torch.div(blocks, side, rounding_mode="floor"), dim=0):
@@ -99,13 +101,13 @@ class Volume:
             places = (((blocks[rows] - first) * SIDE)[:, None] + _MEMBERS.to(blocks)).reshape(-1, 3).unbind(1)
             weights, sums = self.weights[rows].flatten(), self.distances[rows].flatten()
             known = torch.zeros(size, size, size, dtype=torch.bool, device=blocks.device)
-            known[places] = weights > 0
+            known[places] = self.views[rows].flatten() >= confirmed
             distances = torch.ones(size, size, size, device=blocks.device)
-            distances[places] = sums / weights.clamp_min(1)
-            colors = torch.zeros(size, size, size, 3, device=blocks.device)
-            colors[places] = self.colors[rows].reshape(-1, 3) / weights.clamp_min(1)[:, None]
+            distances[places] = sums / torch.where(weights > 0, weights, 1)
+            dense = torch.zeros_like(distances)
+            dense[places] = weights
             end = slice(side * SIDE + 1)
-            cut = (values[end, end, end].cpu().numpy() for values in (distances, colors, known))
+            cut = (values[end, end, end].cpu().numpy() for values in (distances, known, dense))
             yield ((first * SIDE).cpu().numpy(), *cut)
 
 

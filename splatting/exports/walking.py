@@ -16,6 +16,7 @@ from scene.cameras import Camera
 from scene.splats.splats import Splats, opacities
 from splatting.camera_paths.poses import poses_of
 from splatting.exports.mesh import volume_of
+from splatting.exports.surfaces import Surfaces
 from splatting.exports.tsdf import TRUNCATION, Volume
 from splatting.exports.upright import moved_around, moved_splats
 from splatting.files.similarity import Similarity
@@ -30,6 +31,7 @@ LEAF = 4  # voxels of a leaf's edge
 SOLID = 0xFF000000
 _LOW = 0.02  # part of what is opaque that lies under the floor
 _OPAQUE = 0.5
+_CHUNK = 8  # blocks of a cube that is dense
 _THICK = 2  # voxels of the floor where no photo shows it
 _RAIL = 1.0  # metres, around that floor
 _TURN = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])  # from y down to the viewer's axes
@@ -87,9 +89,10 @@ def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace
 
 def _volume(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Volume:
     """Of voxels of VOXEL, or larger ones where the photos or the scene are too coarse or large for these."""
+    surfaces = Surfaces(splats, cameras, pipe)
     for coarser in (1, 2, 4):
         try:
-            return volume_of(splats, cameras, pipe, coarser * VOXEL)
+            return volume_of(surfaces, coarser * VOXEL)
         except UserError as error:
             last = error
     raise UserError(f"--walk needs surfaces of centimetres to some hundred metres ({last}); leave --walk out")
@@ -98,7 +101,7 @@ def _volume(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace)
 def _solid_voxels(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
     """(V, 3) int64: the voxels close behind a surface; and (V,) bool: those of them next to it."""
     places, near = [], []
-    for origin, distances, _, known in volume.chunks(8):
+    for origin, distances, known, _ in volume.chunks(_CHUNK, confirmed=1):
         solid = known & (distances < 0)
         places.append(np.argwhere(solid) + origin)
         near.append(distances[solid] > -1 / TRUNCATION)

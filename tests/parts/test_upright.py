@@ -172,13 +172,19 @@ def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scen
     assert "poses are not those" in capsys.readouterr().err
 
 
+def textured(points: np.ndarray) -> Mesh:
+    """A black triangle."""
+    flat = points[:, :2].astype(np.float32)
+    return Mesh(points, np.int32([[0, 1, 2]]), points, uv=flat, texture=np.zeros((4, 4, 3), np.uint8))
+
+
 @pytest.mark.parametrize("place", [(47.25, 8.5, 410.0), ()])
 @pytest.mark.parametrize("kind", ["splats", "mesh"])
 def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
     """-x of the turned node is east, y up, z north (README of EXT_georeference); x, y, z were east, down, north."""
     splats = replace(moved_splats(balls(), replace(SOME, place=place)), world_offset=(0.0, 0.0, 0.0))
     if kind == "mesh":
-        triangle = Mesh(np.eye(3, dtype=np.float32), np.int32([[0, 1, 2]]), np.zeros((3, 3), np.uint8))
+        triangle = textured(np.eye(3, dtype=np.float32))
         write_glb_mesh(tmp_path / "x.glb", triangle, splats)
     else:
         write_glb(tmp_path / "x.glb", splats)
@@ -199,7 +205,7 @@ def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
 def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
     """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
     points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
-    mesh = Mesh(points, np.int32([[0, 1, 2]]), np.zeros((3, 3), np.uint8))
+    mesh = replace(textured(points), colors=np.zeros((3, 3), np.uint8))
     monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
     for ending, expected in (("ply", points[:, [0, 2, 1]] * [1, 1, -1] if upright else points), ("glb", points)):
         path = tmp_path / f"mesh.{ending}"
