@@ -101,9 +101,10 @@ class Page:
             self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained, photos)
         with self.tabs.add_tab("Path"):
             self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
-        place = None if oriented is None else Place(folder, oriented, gaussians.world_offset)
-        with self.tabs.add_tab("Measure"):
-            self.measure = MeasureTab(self.server, self._cameras, self._find, place, self._tell_set, self._refuse)
+        if untrained or scene.loaded_iter is not None:  # a model that trains moves
+            place = None if oriented is None else Place(folder, oriented, gaussians.world_offset)
+            with self.tabs.add_tab("Measure"):
+                self.measure = MeasureTab(self.server, self._cameras, self._find, place, self._tell_set, self._refuse)
         self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))
         self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
         self.server.initial_camera.near = 1e-3 * self._cameras.size
