@@ -156,13 +156,16 @@ def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 
 def fewer(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface of `triangles`, or of all if they are no more."""
+    """The same surface of `triangles`, or some fewer; of all if they are no more."""
     if len(faces) <= triangles:
         return vertices, faces
     from fast_simplification import simplify
 
     vertices, faces = simplify(vertices, faces, target_count=triangles)
-    return vertices.astype(np.float32), faces.astype(np.int32)
+    # Two faces with the same corners are left of what has closed, back to back.
+    _, same, times = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
+    used, faces = np.unique(faces[times[same.reshape(-1)] == 1], return_inverse=True)
+    return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-_WIDTH = 3  # triangles between the rims of what is too narrow to stay, on each side
+_WIDTH = 2  # triangles between the rims of what is too narrow to stay, on each side
 _SMALL = 0.02
 _ROUNDS = 5  # of smoothing
 
