@@ -251,17 +251,21 @@ def _check_fitting(args: argparse.Namespace, entries: Sequence[Format]) -> None:
 def _check_views(
     args: argparse.Namespace, make_path: Callable[[Poses], TimedPath] | None, cameras: list[Camera]
 ) -> None:
-    """UserError for a --start or --path that the training views do not have, before they are rendered.
+    """UserError for a --start, --notes or --path that the training views do not have, before they are rendered.
 
     A warning if the views are not those of the training.
     """
     from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
+    from splatting.exports.notes import read_notes
     from splatting.exports.page_start import named
 
     if not args.ply:
         warn_if_moved(args.model_path, cameras)
+    names = [str(camera.image_name) for camera in cameras]
     if args.start is not None:
-        named(args.start, [str(camera.image_name) for camera in cameras], f"--start {args.start}")
+        named(args.start, names, f"--start {args.start}")
+    for note in read_notes(args.notes).views if args.notes else ():
+        named(note.camera, names, f"--notes: {note.camera}")
     if make_path and cameras:
         make_path(poses_of(cameras))
 
@@ -308,7 +312,7 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--start", metavar="PHOTO", help="training photo that an .html begins at (default: one that looks straight at "
         "the middle)")  # fmt: skip
     add("--title", metavar="TEXT", help="title of an .html (default: the name of the file)")
-    add("--notes", metavar="FILE", help="Markdown with title, author, date and licence of an .html, and notes on views "
+    add("--notes", metavar="FILE", help="text with title, author, date and licence of an .html, and notes on views "
         "(docs/guide/web_pages.md; default: none)")  # fmt: skip
     add("--walk", action="store_true", help="let guests of an .html walk on the floor and stop at walls (default: off)")
     add("--raw", action="store_true", help="do not --clean an .html (default: cleaned, if its scene is there)")

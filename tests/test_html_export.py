@@ -112,7 +112,7 @@ def test_names_stay_names(tmp_path, name):
     shown = name.encode("utf-8", "backslashreplace").decode()
     content = json.loads(page.texts["page"])
     mark = content["settings"]["annotations"][0]
-    assert page.texts["title"] == page.texts["summary"] == shown and mark["title"] == mark["text"] == name
+    assert page.texts["title"] == page.texts["span"] == shown and mark["title"] == mark["text"] == name
 
 
 def test_a_page_has_the_name_of_its_file_its_background_and_the_viewers_licence(page):

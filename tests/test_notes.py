@@ -11,18 +11,19 @@ from splatting.exports.notes import Note, Notes, read_notes
 from utils.system_utils import UserError
 
 CONTENT = """# Two balls
-author: A. Name
-licence: CC BY 4.0
+Author: A. Name
+GPS:48.1, 11.6
+Author: B. Name
 They float.
 
 Time: it is late.
 
 ## The red one
 camera: photo_3
-Redder <b>than</b> you think.
+Redder: <b>than</b> you think.
 
 ## The blue one
-camera: photo_5.jpg
+Camera:photo_5.jpg
 """
 
 
@@ -34,15 +35,18 @@ def written(tmp_path):
 
 
 def test_a_file_of_notes_has_a_title_facts_text_and_views(written):
-    facts = ("author", "A. Name"), ("licence", "CC BY 4.0")
-    views = Note("The red one", "Redder <b>than</b> you think.", "photo_3"), Note("The blue one", "", "photo_5.jpg")
+    facts = ("Author", "A. Name"), ("GPS", "48.1, 11.6"), ("Author", "B. Name")
+    views = Note("The red one", "Redder: <b>than</b> you think.", "photo_3"), Note("The blue one", "", "photo_5.jpg")
     assert read_notes(str(written)) == Notes("Two balls", facts, "They float.\n\nTime: it is late.", views)
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (b"## Here\nText", "“Here” has no camera; write camera: PHOTO"),
+        (b"## Here\nText", "“Here” has no camera; write a name after ##, and camera: PHOTO below"),
+        (b"## \ncamera: a.jpg", "“” has no camera; write a name after ##"),
+        (b"# One\n# Two", "“# Two” is not the first line; begin views with ##"),
+        (b"Text\n# One", "“# One” is not the first line; begin views with ##"),
         (b"## Here\ncamera: a.jpg\n" + 1001 * b"x", "“Here” has 1,001 letters; shorten it to 1,000"),
         (26 * b"## Here\ncamera: a.jpg\n", "has 26 views, and a page takes 25; remove some"),
         (b"\xff\xfe", "cannot be read as UTF-8 text"),
@@ -63,7 +67,7 @@ def test_a_page_shows_its_notes(written, tmp_path):
     page = Page(path)
     marks = json.loads(page.texts["page"])["settings"]["annotations"]
     assert [(mark["title"], mark["text"]) for mark in marks] == [
-        ("The red one", "Redder <b>than</b> you think."),
+        ("The red one", "Redder: <b>than</b> you think."),
         ("The blue one", ""),
     ]
     assert page.texts["title"] == "Two balls" and "<p>Author: A. Name</p>" in path.read_text(encoding="utf-8")

@@ -1,16 +1,15 @@
-"""What a page tells its guests (--notes): a Markdown file with a title, facts, and notes on views of training photos.
+"""What a page tells its guests (--notes): a text file with a title, facts, and notes on views of training photos.
 
     # My room
-    author: A. Name
-    date: May 2026
-    licence: CC BY 4.0
+    Author: A. Name
+    Licence: CC BY 4.0
     What this place is.
 
     ## The window
     camera: IMG_0012.jpg
     Made in 1920.
 
-Lines `key: value` follow a heading at once; the rest is text. Any key of the title is a fact.
+Facts are lines `name: value` right below the title, and a view's camera is the line below its name. The rest is text.
 """
 
 import re
@@ -21,7 +20,7 @@ from splatting.host.errors import UserError
 
 _MOST = 25  # views, which the viewer takes
 _LONGEST_TEXT = 1000  # letters of a note, which the viewer shows in a box
-_FACT = re.compile(r"([^\W\d_][\w ]{0,30}):\s+(\S.*)")
+_FACT = re.compile(r"([^\W\d_][\w ]{0,30}):\s*(\S.*)")
 
 
 class Note(NamedTuple):
@@ -46,29 +45,32 @@ def read_notes(path: str) -> Notes:
     try:
         content = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"--notes {path} cannot be read as UTF-8 text ({error}); give a Markdown file") from error
-    parts = re.split(r"^(##?)[ \t]+(.*)$", content, flags=re.MULTILINE)
-    title, facts, text, views = "", (), parts[0].strip(), []
-    for marks, heading, body in zip(parts[1::3], parts[2::3], parts[3::3], strict=True):
-        found, words = _facts_of(body)
+        raise UserError(f"--notes {path} cannot be read as UTF-8 text ({error}); give a text file") from error
+    before, *parts = re.split(r"^(##?)[ \t]+(.*)$", content, flags=re.MULTILINE)
+    title, facts, text, views = "", (), before.strip(), []
+    for place, (marks, heading, body) in enumerate(zip(parts[::3], parts[1::3], parts[2::3], strict=True)):
+        name, lines = heading.strip(), body.strip().splitlines()
         if marks == "#":
-            title, facts, text = heading.strip(), tuple(found.items()), words
+            if place or text or not name:
+                raise UserError(f"--notes {path}: “# {name}” is not the first line; begin views with ##")
+            title, facts, text = name, *_facts_of(lines)
             continue
-        camera = found.pop("camera", "")
-        if not camera:
-            raise UserError(f"--notes {path}: “{heading}” has no camera; write camera: PHOTO in the line below it")
+        camera = _FACT.fullmatch(lines[0].strip()) if lines else None
+        if not name or camera is None or camera[1].lower() != "camera":
+            raise UserError(f"--notes {path}: “{name}” has no camera; write a name after ##, and camera: PHOTO below")
+        words = "\n".join(lines[1:]).strip()
         if len(words) > _LONGEST_TEXT:
-            raise UserError(f"--notes {path}: “{heading}” has {len(words):,} letters; shorten it to {_LONGEST_TEXT:,}")
-        views.append(Note(heading.strip(), words, camera))
+            raise UserError(f"--notes {path}: “{name}” has {len(words):,} letters; shorten it to {_LONGEST_TEXT:,}")
+        views.append(Note(name, words, camera[2]))
     if len(views) > _MOST:
         raise UserError(f"--notes {path} has {len(views)} views, and a page takes {_MOST}; remove some")
     return Notes(title, facts, text, tuple(views))
 
 
-def _facts_of(body: str) -> tuple[dict[str, str], str]:
-    """The lines `key: value` at the beginning of a part, and the text after them."""
-    lines, found = body.strip().splitlines(), {}
+def _facts_of(lines: list[str]) -> tuple[tuple[tuple[str, str], ...], str]:
+    """The lines `name: value` at the beginning, and the text after them."""
+    found = []
     while lines and (fact := _FACT.fullmatch(lines[0].strip())):
-        found[fact[1].lower()] = fact[2]
+        found.append((fact[1], fact[2]))
         del lines[0]
-    return found, "\n".join(lines).strip()
+    return tuple(found), "\n".join(lines).strip()

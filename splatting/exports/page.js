@@ -22,12 +22,16 @@ const fit = (degrees, photo = Infinity) => {
 
 // Beside a photo that does not fill the window nobody saw much: the sides fade out until a guest moves.
 const fadeSides = (photo) => {
-  const side = 50 * (1 - photo / least / (innerWidth / innerHeight));
-  if (side <= 0) return;
   const sides = document.querySelector('.sse-sceneLayer').appendChild(document.createElement('div'));
   const color = getComputedStyle(document.body).backgroundColor;
-  sides.style = `position: absolute; inset: 0; pointer-events: none; transition: opacity 1s; background:
-    linear-gradient(90deg, ${color}, transparent ${side}%, transparent ${100 - side}%, ${color})`;
+  sides.style = 'position: absolute; inset: 0; pointer-events: none; transition: opacity 1s';
+  const draw = () => {
+    const side = 50 * Math.max(1 - photo / least / (innerWidth / innerHeight), 0);
+    const clear = `transparent ${side}%, transparent ${100 - side}%`;
+    sides.style.background = side ? `linear-gradient(90deg, ${color}, ${clear}, ${color})` : 'none';
+  };
+  draw();
+  addEventListener('resize', draw);
   for (const moved of ['pointerdown', 'wheel', 'keydown']) addEventListener(moved, () => sides.style.opacity = 0, true);
 };
 
@@ -39,6 +43,13 @@ const closeHelp = () => {
   } catch { /* nothing is kept on this machine */ }
 };
 
+// Keys that open and close the title's text are not the viewer's.
+const about = document.getElementById('about');
+about.addEventListener('keydown', (event) => {
+  if (event.key === 'Escape') about.open = false;
+  event.stopPropagation();
+});
+
 // The viewer asks for what is solid by an address; the answer is in this file.
 const answer = ({ address, about }) => {
   const content = unpacked('solid'), elsewhere = window.fetch.bind(window);
@@ -48,18 +59,30 @@ const answer = ({ address, about }) => {
   };
 };
 
-// Nobody leaves what the photos show: beyond the limits the camera stands still, and the wheel leads no further. Who
-// walks is kept by rails.
-const limited = (viewer, [least, most]) => {
-  const camera = viewer.app.root.findByName('camera');
-  let outside = false;
-  addEventListener('wheel', (event) => { if (outside && event.deltaY > 0) event.stopPropagation(); }, { capture: true });
+// Nobody leaves what the photos show. The viewer places its camera by a vector of its own, which is held within the
+// limits on the way. From there its controls begin anew, where they would fly or pinch on from beyond; the wheel leads
+// no further. Who walks is kept by rails.
+const limited = (viewer, [low, high]) => {
+  const camera = viewer.app.root.findByName('camera'), { events, state } = viewer, put = camera.setPosition.bind(camera);
+  let held = false, outside = false, touched = false;
+  camera.setPosition = (place, ...rest) => {
+    if (place instanceof Object && !state.xrMode && ['orbit', 'fly'].includes(state.cameraMode)) {
+      const { x, y, z } = place;
+      place.set(...[x, y, z].map((value, i) => Math.min(Math.max(value, low[i]), high[i])));
+      held ||= place.x !== x || place.y !== y || place.z !== z;
+    }
+    return put(place, ...rest);
+  };
+  for (const name of ['touchstart', 'touchend', 'touchcancel']) {
+    addEventListener(name, ({ touches }) => { touched = touches.length > 0; }, true);
+  }
+  const stop = (event) => { if (outside && state.cameraMode === 'orbit' && event.deltaY > 0) event.stopPropagation(); };
+  addEventListener('wheel', stop, true);
   return () => {
-    if (viewer.state.xrMode || ['anim', 'walk'].includes(viewer.state.cameraMode)) return;
-    const place = camera.getPosition(), { x, y, z } = place;
-    place.set(...[x, y, z].map((value, i) => Math.min(Math.max(value, least[i]), most[i])));
-    outside = place.x !== x || place.y !== y || place.z !== z;
-    if (outside) camera.setPosition(place);
+    [outside, held] = [held, false];
+    if (outside && (touched || state.cameraMode === 'fly')) {
+      events.fire('cameraMode:changed', state.cameraMode, state.cameraMode);
+    }
   };
 };
 

@@ -50,7 +50,8 @@ def walkable(splats: Splats, around: "Around") -> tuple[Splats, "Around"]:
 
     if not around.upright:
         turn = turn_upright(up_of(poses_of(around.cameras)))
-        splats, around = _moved(splats, around, Similarity(turn, 1.0, np.zeros(3)))
+        upright = Similarity(turn, 1.0, np.zeros(3), splats.place, metric=around.metric)
+        splats, around = _moved(splats, around, upright)
     if not around.metric:
         scale = metres_of(splats, around.cameras)
         splats, around = _moved(splats, around, Similarity(np.eye(3), scale, np.zeros(3), splats.place, metric=True))
@@ -95,7 +96,10 @@ def _volume(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace)
             return volume_of(surfaces, coarser * VOXEL)
         except UserError as error:
             last = error
-    raise UserError(f"--walk needs surfaces of centimetres to some hundred metres ({last}); leave --walk out")
+    said = (
+        "--walk needs a place that is some metres to some hundred metres wide; crop it by --crop, or leave --walk out"
+    )
+    raise UserError(said) from last
 
 
 def _solid_voxels(volume: Volume) -> tuple[np.ndarray, np.ndarray]:

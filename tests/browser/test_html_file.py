@@ -121,6 +121,13 @@ def test_nobody_leaves_what_photos_show(tab, page):
     least, most = json.loads(HtmlPage(page).texts["page"])["limits"]
     assert all(low - 1e-3 <= x <= high + 1e-3 for low, x, high in zip(least, places[1], most, strict=True))
     assert places[1] == pytest.approx(places[0], abs=1e-3) and math.dist(places[1], placed(cameras()[0])[0]) > 0.5
+    tab.evaluate("viewer.state.cameraMode = 'fly'")
+    for forward in (-1, 1):  # far out, and back, which begins at once
+        tab.evaluate(f"viewer.setMoveInput(0, {forward})")
+        tab.wait_for_timeout(1500)
+        places.append(place_of(tab))
+    assert all(low - 1e-3 <= x <= high + 1e-3 for low, x, high in zip(least, places[2], most, strict=True))
+    assert math.dist(places[3], places[2]) > 0.3
 
 
 def test_guests_walk_on_the_floor_and_stop_at_walls(tab, tmp_path):
