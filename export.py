@@ -52,6 +52,7 @@ if TYPE_CHECKING:  # SciPy takes a while to import
     from splatting.camera_paths.poses import Poses
 
 FOR_PHONES = 500_000  # Gaussians of a page
+FEWEST = 100  # triangles that --triangles may ask for
 _DETAILS = "voxel", "triangles", "start", "title", "notes", "walk"  # of `Around`
 
 
@@ -340,8 +341,8 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
         raise UserError("--raw and --clean contradict each other; leave one out")
     if args.voxel is not None and not 0 < args.voxel < math.inf:
         raise UserError(f"--voxel must be above 0, got {args.voxel}")
-    if args.triangles is not None and args.triangles < 1:
-        raise UserError(f"--triangles must be 1 or above, got {args.triangles}")
+    if args.triangles is not None and args.triangles < FEWEST:
+        raise UserError(f"--triangles must be {FEWEST} or above, got {args.triangles}")
     if args.crop and not all(low < high for low, high in zip(args.crop[:3], args.crop[3:], strict=True)):
         raise UserError(f"--crop takes the smaller corner first, x0 y0 z0 x1 y1 z1, got {args.crop}")
     if args.model_path or not args.ply:

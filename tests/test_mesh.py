@@ -26,7 +26,7 @@ from splatting.demo.make_scene import make_scene
 from splatting.exports import mesh
 from splatting.exports.formats import Around, format_of
 from splatting.exports.mesh import Mesh, fewer, mesh_of, vertex_normals, volume_of, zero_level
-from splatting.exports.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims
+from splatting.exports.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims, whole_parts
 from splatting.exports.mesh_files import write_ply_mesh
 from splatting.exports.surfaces import Surfaces, pinholes
 from utils.sh_utils import C0
@@ -158,6 +158,12 @@ def test_fewer_triangles_lie_on_the_same_surface(of_ball):
     distances = np.linalg.norm(away, axis=1)
     assert 400 < len(faces) <= 500 and abs(distances - RADIUS).mean() < 0.02
     assert ((vertex_normals(vertices, faces) * away).sum(axis=1) / distances).min() > 0.8
+    whole = trimesh.creation.icosphere(3)
+    whole = np.float32(whole.vertices), np.int32(whole.faces)
+    with pytest.raises(UserError, match="--triangles 1 leaves nothing of the mesh; give more"):
+        fewer(*whole, 1)
+    with pytest.raises(UserError, match="all surfaces are too narrow for a mesh; give a smaller --voxel"):
+        whole_parts(of_ball.vertices, of_ball.faces[:2], np.ones(len(of_ball.vertices)))
 
 
 def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
@@ -244,6 +250,8 @@ def test_an_obj_spares_foreign_files_beside_it(tmp_path):
         with pytest.raises(UserError, match=rf"no export wrote .*a.mesh.{ending}"):
             format_of("a.mesh.obj").check(tmp_path / "a.mesh.obj")
         other.unlink()
+    with pytest.raises(UserError, match="names the files beside it in UTF-8, which .* is not; choose another --to"):
+        format_of("a.mesh.obj").check(tmp_path / "caf\udce9.mesh.obj")
 
 
 def test_too_small_voxels_are_refused_or_enlarged(ball, views, monkeypatch):
@@ -304,8 +312,8 @@ def test_export_writes_meshes(trained, monkeypatch, tmp_path, capsys):
             ["--to", "a.ply", "--voxel", "0.1"],
             "--voxel is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz; leave it out",
         ),
-        (["--to", "a.ply", "--triangles", "9"], "--triangles is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz"),
-        (["--to", "mesh.ply", "--triangles", "0"], "--triangles must be 1 or above, got 0"),
+        (["--to", "a.ply", "--triangles", "900"], "--triangles is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz"),
+        (["--to", "mesh.ply", "--triangles", "0"], "--triangles must be 100 or above, got 0"),
         (["--to", "mesh.ply", "--path", "spiral"], "--path is for .html; leave it out"),
         (["--to", "mesh.ply", "--voxel", "0"], "--voxel must be above 0, got 0.0"),
     ):

@@ -2,6 +2,7 @@
 
 import contextlib
 import http.client
+import json
 import math
 import socket
 import sys
@@ -26,6 +27,7 @@ from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E
 from splatting.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
 from splatting.viewer import watchers  # noqa: E402
+from splatting.viewer.measure_tab import Place  # noqa: E402
 from splatting.viewer.page import Page, answer  # noqa: E402
 from splatting.viewer.tabs import first_box  # noqa: E402
 from splatting.viewer.untrained import _spheres  # noqa: E402
@@ -387,6 +389,13 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
         click("A length", (0, 1))
         assert tab.length == pytest.approx(2, abs=1e-2) and "units of the scene" in tab.says.content
         assert tab.keep.disabled
+        page.frames.surface = None
+        tab.add("A length", places[0])
+        page._find(None, places[0], lambda point: tab.add("A length", point))  # as on a full GPU
+        answer(page)
+        assert "There is no surface" in tab.says.content and client.until("NotificationShowMessage")["props"]["title"]
+        del page.frames.surface
+        tab.points["A length"] = [places[0], places[1]]
         with pytest.raises(UserError, match="nothing to set right"):
             tab.write()
         tab.metres.value = 5.0
@@ -406,3 +415,19 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
     np.testing.assert_allclose(moved[:3, 1], 0, atol=0.03)
     assert moved[3, 1] == pytest.approx(-2.5, abs=0.05)  # above
     assert moved[1, 0] > moved[2, 0] and moved[1, 2] == pytest.approx(moved[2, 2], abs=0.03)  # the front is along x
+
+
+def test_what_is_measured_spares_another_orientation_of_the_scene(tmp_path):
+    record = {
+        "rotation": np.eye(3).tolist(),
+        "scale": 2.0,
+        "translation": [0, 0, 0],
+        "unit": "metre",
+        "vertical": "GPS",
+    }
+    for where, content in (("model.json", {"similarity": record | {"scale": 3.0}}), ("orientation.json", record)):
+        (tmp_path / where).write_text(json.dumps(content))
+    place = Place(tmp_path, str(tmp_path), (0.0, 0.0, 0.0))
+    assert place.write(record | {"scale": 4.0}) == [tmp_path / "model.json"]
+    assert json.loads((tmp_path / "orientation.json").read_text()) == record
+    assert json.loads((tmp_path / "model.json").read_text())["similarity"]["scale"] == 4

@@ -25,7 +25,6 @@ from utils.system_utils import UserError
 _AWAY = 300.0  # widths of the picture, from the camera to what it shows
 _LONGEST = 1600  # pixels of the longer side
 _OUTLIERS = 0.02  # quantile of the Gaussians at which the picture ends
-
 _RIM = 0.1  # of what is shown, on each side
 _AROUND = 0.5  # of the cameras' largest distance from their middle, that is shown around them
 

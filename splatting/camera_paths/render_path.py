@@ -43,7 +43,7 @@ def add_path_options(parser: argparse.ArgumentParser) -> None:
     kinds = "interpolate, ellipse, spiral, or a JSON file of keyframes, or a picture from above: top"
     group.add_argument("--path", metavar="PATH", help=f"write a video along {kinds}; no views (default: none)")
     group.add_argument("--fps", type=int, metavar="N", help="frames a second (default: 30)")
-    size = "width and height, even (default: that of the first training camera, made even)"
+    size = "width and height, even (default: that of the first training camera, made even; of top, 1600 for the longer)"
     group.add_argument("--size", type=int, nargs=2, metavar=("W", "H"), help=size)
     group.add_argument("--seconds", type=float, metavar="S", help="seconds of a path that is no file (default: 10)")
     group.add_argument("--frames", action="store_true", help="write each frame as PNG, too (default: off)")

@@ -82,4 +82,5 @@ def _escaped(text: str) -> str:
     """A text as TeX shows it; letters that its first fonts lack appear as numbers."""
     plain = " ".join(text.split()).encode("latin-1", "backslashreplace").decode("latin-1")
     safe = "".join(_ESCAPES.get(x, x) for x in plain)
-    return re.sub("-(?=-)", "-{}", safe)  # no dashes
+    safe = re.sub("-(?=-)", "-{}", safe)  # no dashes
+    return "{}" + safe if safe[:1] in ("[", "*") else safe  # which would belong to the line before

@@ -156,7 +156,7 @@ def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 
 def fewer(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface of `triangles`, or some fewer; of all if they are no more."""
+    """The same surface of `triangles`, or some fewer; of all if they are no more. UserError if none would be left."""
     if len(faces) <= triangles:
         return vertices, faces
     from fast_simplification import simplify
@@ -165,6 +165,8 @@ def fewer(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.n
     # Two faces with the same corners are left of what has closed, back to back.
     _, same, times = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
     used, faces = np.unique(faces[times[same.reshape(-1)] == 1], return_inverse=True)
+    if not len(faces):
+        raise UserError(f"--triangles {triangles} leaves nothing of the mesh; give more")
     return vertices[used].astype(np.float32), faces.reshape(-1, 3).astype(np.int32)
 
 

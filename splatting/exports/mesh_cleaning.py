@@ -2,6 +2,8 @@
 
 import numpy as np
 
+from utils.system_utils import UserError
+
 _WIDTH = 2  # triangles between the rims of what is too narrow to stay, on each side
 _SMALL = 0.02
 _ROUNDS = 5  # of smoothing
@@ -14,8 +16,14 @@ def area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def whole_parts(vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces of the broad and large parts of a mesh. weights (V,): how well views see the vertices."""
-    return large_parts(vertices, broad(faces, len(vertices)), weights)
+    """Vertices and faces of the broad and large parts of a mesh. weights (V,): how well views see the vertices.
+
+    UserError where nothing is broad.
+    """
+    left = broad(faces, len(vertices))
+    if not len(left):
+        raise UserError("all surfaces are too narrow for a mesh; give a smaller --voxel, or a larger --crop")
+    return large_parts(vertices, left, weights)
 
 
 def broad(faces: np.ndarray, count: int) -> np.ndarray:

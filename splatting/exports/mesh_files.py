@@ -21,6 +21,7 @@ from scene.gaussians.ply import frame_comments
 from scene.splats.splats import Splats
 from splatting.exports.scene_formats import find_pxr, georeference, write_binary_gltf, write_usd_package
 from splatting.files.ours import refuse_foreign, write_picture
+from splatting.host.listing import as_utf8
 from utils.system_utils import UserError, atomic_write
 
 if TYPE_CHECKING:  # which needs SciPy
@@ -119,6 +120,10 @@ def _jpeg(mesh: Mesh) -> bytes:
 def check_obj_mesh(path: str | os.PathLike) -> None:
     """UserError without what an OBJ needs, or for foreign files in the way of those beside it."""
     find_packages(path)
+    if as_utf8(name := Path(path).stem) != name:
+        raise UserError(
+            f"an OBJ names the files beside it in UTF-8, which “{as_utf8(name)}” is not; choose another --to"
+        )
     refuse_foreign(Path(path).with_suffix(".png"))
     material = Path(path).with_suffix(".mtl")
     if os.path.lexists(material) and not (material.is_file() and material.read_text("utf-8", "replace") == _mtl(path)):

@@ -7,7 +7,7 @@ from splatting.exports.mesh_cleaning import area_vectors
 from splatting.exports.mesh_colors import colors_of
 from splatting.exports.surfaces import Surfaces
 
-_LARGEST = 4096  # pixels of the longer side
+_LARGEST = 4096  # pixels of the longer side that are asked for; gaps between charts take more
 _GAP = 4  # pixels between charts, so that smaller copies of the image do not mix them
 _GROUP = 1000  # triangles that are laid out at once: the time for more grows faster than their number
 _AT_ONCE = 1 << 20  # pixels

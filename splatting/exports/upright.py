@@ -20,8 +20,12 @@ from utils.system_utils import UserError
 def add_upright_options(add: Callable[..., Any]) -> None:
     """Add options to those of export.py."""
     add("--upright", action="store_true",
-        help="turn and scale the model as convert.py --orient found (default: on for pages and meshes)")  # fmt: skip
-    add("--no_upright", action="store_true", help="keep pages and meshes in the frame of the scene (default: off)")
+        help="turn and scale as convert.py --orient found (default: on for pages, meshes and levels)")  # fmt: skip
+    add(
+        "--no_upright",
+        action="store_true",
+        help="keep pages, meshes and levels in the scene's frame (default: off)",
+    )
 
 
 def check_upright(args: argparse.Namespace) -> None:

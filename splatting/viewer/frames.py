@@ -29,6 +29,7 @@ LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
 _ASKED = 17  # pixels of the sides of a view of one ray
+_WIDEST = 60.0  # degrees that these pixels see, in a window of few pixels
 _NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
 
 
@@ -91,7 +92,7 @@ class Frames:
         """
         axes = rotation_matrix(pose.wxyz)
         place, turn = np.array(pose.position), facing(ray, -axes[:, 1])
-        key = keyframe(0.0, place, turn, _ASKED * math.degrees(pose.fov) / pose.height)
+        key = keyframe(0.0, place, turn, min(_ASKED * math.degrees(pose.fov) / pose.height, _WIDEST))
         device = self.gaussians.get_xyz.device
         view = free_view(_ASKED, _ASKED, math.radians(key.fov), key.position, key.wxyz, device)
         depth = surface_of(view, shown_part(self.gaussians, settings, self.kept), self._pipe).depth

@@ -10,7 +10,7 @@ import numpy as np
 from arguments import add_to_model_json
 from splatting.files.json_files import MODEL_JSON, write_json
 from splatting.files.measured import measured_record
-from splatting.files.similarity import ENTRY, FILE, Similarity, recorded_similarity
+from splatting.files.similarity import ENTRY, FILE, Similarity, read_orientation, recorded_similarity
 from splatting.viewer.tabs import Tell, serialized
 from splatting.viewer.views import Pose, SceneCameras, pose_of
 from utils.system_utils import UserError
@@ -38,6 +38,8 @@ class Place:
     def __init__(self, folder: Path, scene: str, offset: tuple[float, float, float]) -> None:
         self._folder, self._scene, self.offset = folder, scene, np.array(offset, np.float64)
         self.record: dict[str, Any] | None = recorded_similarity(str(folder), scene).get(ENTRY)
+        of_scene = read_orientation(Path(scene)) if scene else None
+        self._of_scene = bool(scene) and (of_scene is None or of_scene == self.record)
 
     @property
     def unit(self) -> tuple[float, str]:
@@ -46,9 +48,9 @@ class Place:
         return (known.scale, "m") if known and known.metric else (1.0, "units of the scene")
 
     def write(self, record: dict[str, Any]) -> list[Path]:
-        """Keep a record where convert.py --orient does, and in the model; the files."""
+        """Keep a record in the model, and where convert.py --orient does unless another one is there; the files."""
         written = []
-        if self._scene:
+        if self._of_scene:
             written.append(Path(self._scene) / FILE)
             write_json(written[0], record)
         if (self._folder / MODEL_JSON).is_file() or not written:

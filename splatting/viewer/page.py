@@ -42,7 +42,7 @@ _COARSE_QUALITY, _FULL_QUALITY = 70, 95  # of the JPEG
 _BETWEEN = 1 / 60  # seconds from frame to frame, at least
 _WAIT = 0.5  # seconds until a signal is noticed
 _READ = 10.0  # seconds after which a message vanishes
-PATHS, CROPS = "camera_paths", "crops"  # in the model's folder, which is where a browser can write
+PATHS, CROPS = "camera_paths", "crops"  # in the model's folder, where a browser can write; also the orientation
 
 
 class Page:
@@ -74,7 +74,7 @@ class Page:
         self._cameras = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
         self.frames = Frames(gaussians, self._cameras, pipe, with_exposures)
         self.frames.kept = kept
-        if not (of_file or untrained):
+        if scene.getTrainCameras() and not (of_file or untrained):
             self.frames.coverage = Coverage(scene.getTrainCameras(), self._cameras.size)
         self.watchers = Watchers()
         self.requests = Requests(self.watchers.wake)
@@ -210,7 +210,15 @@ class Page:
             name.suggest()
 
     def _find(self, pose: Pose, ray: np.ndarray, found: Callable[[np.ndarray | None], None]) -> None:
-        self.requests.ask(lambda: found(self.frames.surface(self.settings(), pose, ray)))
+        def ask() -> None:
+            point = None
+            try:
+                point = self.frames.surface(self.settings(), pose, ray)
+            except Exception as error:  # as for a frame
+                self.notify("No point", first_line(error), color="red")
+            found(point)
+
+        self.requests.ask(ask)
 
     def _tell_set(self, client: "viser.ClientHandle", files: list[Path]) -> None:
         names = " and ".join(map(str, files))
