@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 from html_scene import balls, cameras
 from test_html_export import Page
@@ -70,6 +71,8 @@ def test_a_page_shows_its_notes(written, tmp_path):
         ("The red one", "Redder: <b>than</b> you think."),
         ("The blue one", ""),
     ]
+    for mark in marks:  # stands at the balls, which are 0.45 thick and 3.7 away
+        assert 2.7 < np.linalg.norm(np.subtract(mark["position"], mark["camera"]["initial"]["position"])) < 4
     assert page.texts["title"] == "Two balls" and "<p>Author: A. Name</p>" in path.read_text(encoding="utf-8")
     write_html(path, balls(), cameras(), title="Mine", notes=read_notes(str(written)))
     assert Page(path).texts["title"] == "Mine"

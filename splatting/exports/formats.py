@@ -94,14 +94,16 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
 
         splats, around = walkable(splats, around)
         solid = solid_of(splats, around.cameras, around.pipe)
+    notes = read_notes(around.notes) if around.notes else None
     names = [str(camera.image_name) for camera in around.cameras]
     if around.start is not None:
         start = named(around.start, names, f"--start {around.start}")
+    elif notes and notes.views:
+        start = named(notes.views[0].camera, names, f"--notes: {notes.views[0].camera}")
     else:
         start = best_start(poses_of(around.cameras)) if names else 0
     picture = _picture_of(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
-    notes = read_notes(around.notes) if around.notes else None
     write_html(path, splats, around.cameras, *how, around.upright, around.metric, notes, solid)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 

@@ -10,6 +10,7 @@ import io
 import json
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from scene.cameras import Camera
 from scene.splats.ply import packed_ply
-from scene.splats.splats import Splats, rotated
+from scene.splats.splats import Splats, opacities, rotated
 from splatting.camera_paths.keyframes import TimedPath
 from splatting.camera_paths.poses import Poses, focus_point, poses_of
 from splatting.exports.notes import Note, Notes
@@ -38,6 +39,7 @@ _MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
 BOOKMARKS = 10  # where no notes say which
 _TITLE = 60  # letters of their titles, as the viewer has it
 _ASIDE, _UNDER = 0.5, 0.25  # of the usual depth, by which guests may leave the cameras' box, sideways and down
+_MIDDLE = 0.05  # of the depth, around a camera's axis
 _USUAL_DEPTH = 2.0  # metres from a camera to what it looks at, where nothing tells the scale
 SOLID = "model:/solid.voxel.json"  # where the viewer asks for what is solid; page.js answers
 _KEYS_A_SECOND = 10
@@ -88,6 +90,7 @@ def write_html(
     # The median distance of the Gaussians from the page's first camera.
     distance = float(np.median(np.linalg.norm(splats.means - poses.positions[start], axis=1))) if len(splats) else 1.0
     aspects = [camera.image_width / camera.image_height for camera in cameras]
+    ahead = partial(_ahead, splats, poses)
     notes, depth = notes or Notes(), float(np.median(_depths(poses, focus_point(poses), distance)))
     page = {
         "antialiasing": splats.antialiasing,
@@ -96,7 +99,7 @@ def write_html(
         "limits": limits(poses, _VIEWER_AXES @ turn, depth),
         "metre": 1.0 if metric else depth / _USUAL_DEPTH,
         "solid": solid and {"address": SOLID, "about": solid.about},
-        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects, notes.views),
+        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects, notes.views, ahead),
     }
     content = _template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
@@ -169,13 +172,14 @@ def settings(
     start: int = 0,
     aspects: Sequence[float] | None = None,
     notes: Sequence[Note] = (),
+    ahead: Callable[[int], float | None] = lambda _: None,
 ) -> dict[str, Any]:
     """The settings of a model that was turned by `turn` (3,3).
 
     poses, names: of the training cameras before that. path: the animation, in the same frame. background: RGB in [0,1].
     distance: of the model, about which cameras that are all in one place turn. start: which camera the viewer begins
     at. aspects: width over height of the photos; None: all are square. notes: the bookmarks; none: BOOKMARKS cameras.
-    Opening angles are vertical, in degrees.
+    ahead: how far away a camera sees the thing in its middle, None: not known. Opening angles are vertical, in degrees.
     """
     aspects = aspects or [1.0] * len(poses)
     axes = _VIEWER_AXES @ turn
@@ -187,6 +191,11 @@ def settings(
     else:
         chosen = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
         marked = [(n, f"View {place} of {len(chosen)}", "") for place, n in enumerate(chosen, 1)]
+    marks = [_bookmark(title, text, cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n, title, text in marked]
+    if notes:  # stand at the things, where the viewer shows their texts
+        for mark, (n, _, _) in zip(marks, marked, strict=True):
+            thing = poses.positions[n] + (ahead(n) or depths[n]) * poses.forward[n]
+            mark["position"] = (axes @ thing).tolist()
     return {
         "version": 2,
         "tonemapping": "none",
@@ -195,9 +204,7 @@ def settings(
         "postEffectSettings": _NO_EFFECTS,
         "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
         "cameras": [{"initial": cameras[start]}],
-        "annotations": [
-            _bookmark(title, text, cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n, title, text in marked
-        ],
+        "annotations": marks,
         "startMode": "default" if path is None else "animTrack",
     }
 
@@ -208,6 +215,15 @@ def _depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarr
         return np.full(len(poses), max(poses.spread or distance, 1e-3))
     ahead = ((focus - poses.positions) * poses.forward).sum(axis=1)
     return np.where(ahead > 0, ahead, np.median(ahead))
+
+
+def _ahead(splats: Splats, poses: Poses, camera: int) -> float | None:
+    """How far away opaque Gaussians begin in the middle of a camera's view; None without any."""
+    offsets = splats.means - poses.positions[camera]
+    depths = offsets @ poses.forward[camera]
+    aside = np.linalg.norm(offsets - depths[:, None] * poses.forward[camera], axis=1)
+    found = depths[(depths > 0) & (aside < _MIDDLE * depths) & (opacities(splats) > 0.5)]
+    return float(np.quantile(found, 0.25)) if len(found) else None
 
 
 def limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:

@@ -54,6 +54,7 @@ def walkable(splats: Splats, around: "Around") -> tuple[Splats, "Around"]:
         splats, around = _moved(splats, around, upright)
     if not around.metric:
         scale = metres_of(splats, around.cameras)
+        print(f"--walk: photos are taken to be made {EYES} m above the floor, which makes a unit {scale:.3g} m")
         splats, around = _moved(splats, around, Similarity(np.eye(3), scale, np.zeros(3), splats.place, metric=True))
     return splats, around
 
@@ -84,6 +85,8 @@ def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace
     x, z = (np.arange(low[axis], high[axis] + 1) for axis in (0, 2))
     rail = np.arange(level - round(_RAIL / volume.voxel), level)
     floor = [x, level + np.arange(_THICK), z], [x[[0, -1]], rail, z], [x, rail, z[[0, -1]]]
+    across = " x ".join(f"{volume.voxel * len(side):.0f}" for side in (x, z))
+    print(f"--walk: a place of {across} metres; the viewer offers to walk from 5 x 5 on")
     added = [np.stack(np.meshgrid(*ranges, indexing="ij"), -1).reshape(-1, 3) for ranges in floor]
     return octree(np.concatenate([voxels, *added]) @ _TURN.astype(np.int64), volume.voxel)
 
