@@ -122,7 +122,7 @@ def _template() -> jinja2.Template:
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
     texts = {name: (FOLDER / file).read_text(encoding="utf-8") for name, file in _TEXTS.items()}
     viewer = _in_base64((FOLDER / VIEWER).read_bytes())
-    return environment.get_template("page.html.jinja", globals={**texts, "record": read_json(RECORD), "viewer": viewer})
+    return environment.get_template("page.html.jinja", globals=dict(texts, record=read_json(RECORD), viewer=viewer))
 
 
 def _in_base64(content: bytes) -> str:
