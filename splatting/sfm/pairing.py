@@ -14,6 +14,7 @@ import numpy as np
 import pycolmap
 
 from scene.agreement import joined
+from splatting.sfm.database import opened
 
 _NEXT, _NEAREST, _NEAREST_BY_GPS = 5, 20, 10  # other photos of a photo
 _MORE = 40  # of the group, which a photo outside of it is matched with first; then twice as many, and so on
@@ -30,7 +31,7 @@ def rounds(path: str, all_of: int) -> Iterator[Pairs]:
 
     path: of a database with features. all_of: number of photos, up to which every pair is matched.
     """
-    database = pycolmap.Database.open(path)
+    database = opened(path)
     images = sorted(database.read_all_images(), key=lambda image: image.name)
     numbers = [image.image_id for image in images]
     if len(numbers) <= all_of:
@@ -111,7 +112,7 @@ def gps_places(database: pycolmap.Database, numbers: list[int]) -> np.ndarray:
 
 def bound_pairs(path: str) -> list[tuple[int, int]]:
     """Pairs with enough verified matches to bind their photos."""
-    database = pycolmap.Database.open(path)
+    database = opened(path)
     counted = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
     pairs = [pycolmap.pair_id_to_image_pair(number) for number, count in counted if count >= _BOUND]
     database.close()

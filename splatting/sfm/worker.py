@@ -22,6 +22,7 @@ import pycolmap
 
 from scene.agreement import judge
 from splatting.sfm import pairing
+from splatting.sfm.database import opened
 from splatting.sfm.reduced import ABOUT, ENLARGED, FEW, enlarged, longest_side, reduce_photos
 
 SEED = 0
@@ -46,7 +47,7 @@ def features(job: dict[str, Any]) -> None:
         reader.mask_path = job["masks"]
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = job["max_num_features"]
-    pycolmap.Database.open(job["database"]).close()
+    opened(job["database"]).close()
     # Masks and given cameras belong to the photos as they are.
     images = job["images"] if job["masks"] or job["mapper"] == "triangulation" else job["small"]
     if job["mapper"] == "triangulation":
@@ -74,7 +75,7 @@ def features(job: dict[str, Any]) -> None:
 
 def _refuse_strangers(job: dict[str, Any]) -> None:
     """End the program if COLMAP did not take all photos: it leaves out those of another size than their camera."""
-    database = pycolmap.Database.open(job["database"])
+    database = opened(job["database"])
     known = {image.name for image in database.read_all_images()}
     database.close()
     if missing := [name for names in job["groups"] for name in names if name not in known]:
@@ -86,7 +87,7 @@ def _refuse_strangers(job: dict[str, Any]) -> None:
 
 def _by_octave(path: str) -> dict[int, list[str]]:
     """Photos of a database by SIFT's first octave, which is -1 where they are small and enlarged twofold."""
-    database = pycolmap.Database.open(path)
+    database = opened(path)
     images, sizes = database.read_all_images(), {one.camera_id: one for one in database.read_all_cameras()}
     database.close()
     longest = ABOUT * max(longest_side(len(images)), ENLARGED)
@@ -123,7 +124,7 @@ def matching(job: dict[str, Any]) -> None:
 
 def _assume_focal_lengths(path: str) -> None:
     """Give fisheyes whose photos tell no focal length one to begin with: pycolmap verifies no pair without."""
-    database = pycolmap.Database.open(path)
+    database = opened(path)
     for camera in database.read_all_cameras():
         if camera.is_perspective_fisheye() and not camera.has_prior_focal_length:
             params = camera.params
@@ -172,7 +173,7 @@ def _photos(job: dict[str, Any]) -> str:
 
 def _is_dense(path: str) -> bool:
     """Whether there are many photos with many matches, of which some are enough."""
-    database = pycolmap.Database.open(path)
+    database = opened(path)
     count, matches = database.num_images(), database.num_inlier_matches()
     database.close()
     return count > FEW and matches > DENSE * count
@@ -230,7 +231,7 @@ def _given(path: str) -> pycolmap.Reconstruction:
 
 def _enter_given(job: dict[str, Any]) -> None:
     """Write the cameras and photos of given.json into the database, with the same ids."""
-    model, database = _given(job["given"]), pycolmap.Database.open(job["database"])
+    model, database = _given(job["given"]), opened(job["database"])
     for number, camera in model.cameras.items():
         database.write_camera(camera, use_camera_id=True)
         database.write_rig(model.rigs[number], use_rig_id=True)
