@@ -32,8 +32,8 @@ class TimeBudget(Part):
             check=within(0, 31_536_000),  # a year
             help="seconds to train, without scores and saves, or more if a finished run is resumed; 0: no "
                  "limit. The schedule of --iterations is fitted into them, with at most 25 Gaussians for each "
-                 "iteration. --strategy auto then means budget, or mcmc for at most 50 photos on a GPU with 0.25 "
-                 "s or more for each"),
+                 "iteration, on a GPU up to 50 for 100 photos. --strategy auto then means budget, or mcmc for at most "
+                 "50 photos on a GPU with 0.25 s or more for each"),
         Option("schedule", "", origin="ours", compared=False, topic="quality and speed",
             help="schedule.json of a run with --time_budget: repeat its schedule, independent of the clock. Or a "
                  "number: fit the whole schedule of --iterations into this many iterations"),
@@ -74,11 +74,15 @@ class TimeBudget(Part):
                 setattr(opt, name, int(part * opt.iterations))
 
     def begin(self, run: Any, state: Any) -> None:
-        from splatting.parts.time_budget_schedule import SHORT
+        from scene.gaussians.density_rules import band_rate
+        from splatting.parts.time_budget_schedule import AN_ITERATION, SHORT
 
         run.schedule.random = _is_random(run.scene)
         run.schedule.short = SHORT[run.device.type]
-        run.schedule.megapixels = run.scene.training_pixels()[0] / len(run.scene.getTrainCameras()) / 1e6
+        cameras = run.scene.getTrainCameras()
+        run.schedule.megapixels = run.scene.training_pixels()[0] / len(cameras) / 1e6
+        if run.device.type == "cuda":
+            run.schedule.an_iteration = AN_ITERATION * max(band_rate(cameras), 1.0)
         fill(run, "sizes", Sizes(run.schedule, run.scene.images), self)
 
     def changes(self, iteration: int) -> bool:

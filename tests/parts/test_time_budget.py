@@ -15,6 +15,7 @@ from trainings import before_steps, train_on
 
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.training_log import Stopwatch
+from splatting.parts import time_budget
 from splatting.parts.time_budget import Sizes
 from splatting.parts.time_budget_file import read_schedule, schedule_of, write_schedule
 from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule, TimeBudget
@@ -555,6 +556,19 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     assert counts[-1] == pytest.approx(fits, rel=0.12)
     (said,) = capsys.readouterr().err.splitlines()
     assert re.fullmatch("--time_budget 20 is enough to train about [0-9,]+ Gaussians, not 50,000, as it has .*", said)
+
+
+@pytest.mark.parametrize(
+    ("device", "photos", "wanted"), [("cuda", 20, 25), ("cuda", 75, 37.5), ("cuda", 300, 50), ("cpu", 300, 25)]
+)
+def test_many_photos_on_a_gpu_train_more_gaussians(device, photos, wanted):
+    info = SimpleNamespace(point_cloud=None, ply_path=None)
+    scene = SimpleNamespace(
+        getTrainCameras=lambda: [None] * photos, training_pixels=lambda: (1e6, 1), images=None, info=info
+    )
+    run = SimpleNamespace(scene=scene, device=torch.device(device), schedule=_fresh(3000, 20.0))
+    time_budget.TimeBudget().begin(run, None)
+    assert run.schedule.an_iteration == wanted
 
 
 def test_a_strategy_of_a_damaged_file_is_none():
