@@ -7,10 +7,14 @@ import math
 import sys
 from types import ModuleType
 
+import numpy as np
 import pytest
+import scipy.special
 import torch
 from diff_gaussian_rasterization import gsplat_programs
 from diff_gaussian_rasterization.gsplat import MODES, rasterization
+from diff_gaussian_rasterization.harmonics import sh_basis
+from rasterizer_tools import CPU_AND_GPU
 from torch import Tensor
 
 from utils.general_utils import build_rotation
@@ -59,12 +63,10 @@ class Inputs:
 NAMES = ("means", "quats", "scales", "opacities", "colors", "views")
 
 
-def composited(given: Inputs, mode: str, antialiased: bool, eps2d: float) -> tuple[Tensor, Tensor]:
-    """Images and alphas of pinholes, pixel by pixel (Zwicker et al. 2001; Kerbl et al. 2023)."""
-    y, x = torch.meshgrid(*(torch.arange(n, dtype=DOUBLE) + 0.5 for n in (HEIGHT, WIDTH)), indexing="ij")
-    images, alphas = [], []
-    for n in range(CAMERAS):
-        view, K = given.views[n], given.Ks[n]
+def described(given: Inputs, antialiased: bool, eps2d: float) -> dict[str, Tensor]:
+    """Means, depths, conics and opacities on the images of pinholes (Zwicker et al. 2001; Kerbl et al. 2023)."""
+    found = {"means2d": [], "depths": [], "conics": [], "opacities": []}
+    for view, K in zip(given.views, given.Ks, strict=True):
         at = given.means @ view[:3, :3].T + view[:3, 3]
         R = view[:3, :3] @ build_rotation(given.quats) * given.scales[:, None]
         limit = [((size - K[i, 2]) / K[i, i] + 0.15 * size / K[i, i], K[i, 2] / K[i, i] + 0.15 * size / K[i, i])
@@ -76,10 +78,23 @@ def composited(given: Inputs, mode: str, antialiased: bool, eps2d: float) -> tup
                          zero, K[1, 1] / depth, -K[1, 1] * t[1] / depth], 1).view(-1, 2, 3)  # fmt: skip
         flat = J @ R @ R.mT @ J.mT
         wide = flat + eps2d * torch.eye(2, dtype=DOUBLE)
-        opacity = given.opacities * ((flat.det() / wide.det()).clamp_min(0).sqrt() if antialiased else 1)
-        dx, dy = (K[i, i] * at[:, i] / depth + K[i, 2] - p.reshape(-1, 1) for i, p in enumerate((x, y)))
         inverse = wide.inverse()
-        power = 0.5 * (inverse[:, 0, 0] * dx**2 + inverse[:, 1, 1] * dy**2) + inverse[:, 0, 1] * dx * dy
+        found["means2d"].append(torch.stack([K[i, i] * at[:, i] / depth + K[i, 2] for i in (0, 1)], 1))
+        found["depths"].append(depth)
+        found["conics"].append(torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1))
+        factor = (flat.det() / wide.det()).clamp_min(0).sqrt() if antialiased else 1
+        found["opacities"].append(given.opacities * factor)
+    return {name: torch.stack(values) for name, values in found.items()}
+
+
+def composited(given: Inputs, mode: str, notes: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+    """Images and alphas of what is described, pixel by pixel."""
+    y, x = torch.meshgrid(*(torch.arange(n, dtype=DOUBLE) + 0.5 for n in (HEIGHT, WIDTH)), indexing="ij")
+    images, alphas = [], []
+    for n in range(len(given.views)):
+        means, depth, conics, opacity = (notes[name][n] for name in ("means2d", "depths", "conics", "opacities"))
+        dx, dy = (means[:, i] - p.reshape(-1, 1) for i, p in enumerate((x, y)))
+        power = 0.5 * (conics[:, 0] * dx**2 + conics[:, 2] * dy**2) + conics[:, 1] * dx * dy
         alpha = (opacity * (-power).exp()).clamp_max(0.999)
         alpha = torch.where((alpha >= 1 / 255) & (depth > 0.01), alpha, 0)
         order = depth.detach().argsort()
@@ -88,7 +103,7 @@ def composited(given: Inputs, mode: str, antialiased: bool, eps2d: float) -> tup
         left = torch.cat([torch.ones(len(alpha), 1, dtype=DOUBLE), (1 - alpha).cumprod(1)], 1)
         color = given.colors
         if given.degree is not None:
-            away = torch.nn.functional.normalize(given.means - torch.linalg.inv(view)[:3, 3], dim=1)
+            away = torch.nn.functional.normalize(given.means - torch.linalg.inv(given.views[n])[:3, 3], dim=1)
             color = (eval_sh(given.degree, color.mT, away) + 0.5).clamp_min(0)
         parts = [color] * mode.startswith("RGB") + [depth[:, None]] * mode.endswith("D")
         behind = torch.nn.functional.pad(given.backgrounds[n], (0, 1))[-sum(part.shape[1] for part in parts) :]
@@ -107,7 +122,7 @@ def composited(given: Inputs, mode: str, antialiased: bool, eps2d: float) -> tup
 def test_images_and_gradients_are_those_of_plain_compositing(mode, form):
     for seed, (eps2d, antialiased) in enumerate([(0.3, form[0] == 7), (0.05, form[0] != 7)]):
         given = Inputs(seed, *form)
-        expected = composited(given, mode, antialiased, eps2d)
+        expected = composited(given, mode, described(given, antialiased, eps2d))
         options = {"rasterize_mode": "antialiased" if antialiased else "classic", "eps2d": eps2d}
         found = given.draw(render_mode=mode, **options)[:2]
         pairs = dict(zip(("image", "alpha"), zip(found, expected, strict=True), strict=True))
@@ -117,6 +132,145 @@ def test_images_and_gradients_are_those_of_plain_compositing(mode, form):
                 got, wanted = got[:, :3], wanted[:, :3]  # the last row of a pose is no input
             scale = wanted.abs().max().clamp_min(1e-9)
             assert (got - wanted).abs().max() < 1e-9 * scale, (name, seed)
+
+
+@pytest.mark.parametrize(("packed", "cameras"), [(False, 1), (True, 1), (False, 2), (True, 2)])
+@pytest.mark.parametrize("hooked", ["means2d", "conics", "opacities", "depths", None])
+def test_notes_are_part_of_the_graph(hooked, packed, cameras):
+    """A loss of notes and image; and a hook that changes the gradient of one of them, in place."""
+    found = []
+    for ours in (False, True):
+        given = Inputs(8)
+        for name in ("views", "Ks", "backgrounds"):
+            setattr(given, name, getattr(given, name)[:cameras])
+        if ours:
+            image, _, notes = given.draw(packed=packed, render_mode="RGB+D", rasterize_mode="antialiased")
+            rows = (notes["camera_ids"], notes["gaussian_ids"]) if packed else (notes["radii"] > 0).all(-1)
+        else:
+            notes = described(given, True, 0.3)
+            image = composited(given, "RGB+D", notes)[0]
+            rows = (given.draw(packed=False)[2]["radii"] > 0).all(-1)
+        if hooked:
+            notes[hooked].register_hook(
+                (lambda gradient: gradient.mul_(3.0)) if ours else lambda gradient: 3.0 * gradient
+            )
+        loss = image.square().mean()
+        for name in ("means2d", "conics", "opacities", "depths") if not hooked else ():
+            values = notes[name] if ours and packed else notes[name][rows]
+            loss = loss + (values * torch.arange(1, values.numel() + 1, dtype=DOUBLE).view_as(values)).sin().sum()
+        found.append(torch.autograd.grad(loss, [given.wanted[name] for name in NAMES if name != "views"]))
+    for got, wanted in zip(*found[::-1], strict=True):
+        assert (got - wanted).abs().max() < 1e-9 * wanted.abs().max()
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("packed", [False, True])
+def test_float32_agrees_with_float64(packed, device):
+    """Image, notes, lists and gradients, of SH and of many channels, by kernels of each device."""
+    for seed, (channels, degree) in enumerate([(3, 3), (3, None), (2, None), (37, None)]):
+        found = []
+        for like in ({"dtype": DOUBLE}, {"dtype": torch.float32, "device": device}):
+            given = Inputs(seed, channels, degree)
+            for name in (*NAMES, "Ks", "backgrounds"):
+                setattr(given, name, getattr(given, name).detach().to(**like).requires_grad_(name in NAMES))
+            image, alpha, meta = given.draw(packed=packed, render_mode="RGB+D", absgrad=channels < 32)
+            meta["means2d"].retain_grad()
+            weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=DOUBLE)
+            (image * weights.to(image)).sum().backward()
+            notes = [
+                meta[name] for name in ("means2d", "depths", "conics", "opacities", "flatten_ids", "isect_offsets")
+            ]
+            grads = [getattr(given, name).grad for name in NAMES]
+            found.append([image, alpha, *notes, meta["means2d"].grad, *grads])
+            if channels < 32:
+                found[-1].append(meta["means2d"].absgrad)
+        for wanted, got in zip(*found, strict=True):
+            assert wanted.shape == got.shape
+            assert (got.cpu().double() - wanted).abs().max() <= 1e-4 * wanted.abs().max(), (channels, degree)
+
+
+def test_a_hook_of_one_pass_changes_no_other():
+    """Gradients of means2d alone, then of all without the image, then of all."""
+    given = Inputs(8)
+    image, _, notes = given.draw(packed=False)
+    (first,) = torch.autograd.grad(image.sum(), notes["means2d"], retain_graph=True)
+    (own,) = torch.autograd.grad(notes["means2d"].sum(), given.means, retain_graph=True)
+    (both,) = torch.autograd.grad(image.sum() + notes["means2d"].sum(), given.means, retain_graph=True)
+    (shown,) = torch.autograd.grad(image.sum(), given.means)
+    assert first.any() and own.any() and torch.allclose(own + shown, both, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_lists_of_tiles_are_made_when_they_are_read(packed):
+    given = Inputs(9)
+    meta = given.draw(packed=packed)[2]
+    assert "isect_ids" not in meta
+    ids, numbers, begins = (meta[name] for name in ("isect_ids", "flatten_ids", "isect_offsets"))
+    assert begins.shape == (CAMERAS, 2, 3) and len(ids) == len(numbers) == meta["tiles_per_gauss"].sum()
+    assert torch.equal(ids, ids.sort()[0]) and torch.equal(numbers.bincount(), meta["tiles_per_gauss"].flatten())
+    depths = meta["depths"].flatten()[numbers].float()
+    assert torch.equal(ids & 0xFFFFFFFF, depths.view(torch.int32).long())
+    tiles = ids >> 32
+    assert torch.equal(tiles >> 3, torch.repeat_interleave(torch.tensor([0, 1]), (tiles >> 3).bincount()))
+    assert torch.equal(
+        begins.flatten(), torch.searchsorted(tiles, torch.tensor([0, 1, 2, 3, 4, 5, 8, 9, 10, 11, 12, 13]))
+    )
+    assert "isect_ids" in meta
+    with pytest.raises(KeyError, match="nothing"):
+        meta["nothing"]
+    with pytest.raises(ValueError, match="a tile_size of 16 alone, got 8"):
+        given.draw(tile_size=8)[2]["isect_ids"]
+
+
+@pytest.mark.parametrize("degree", [2, 4])
+def test_signals_come_beside_the_image(degree):
+    """Signals as SH and as values, each beside colours by themselves; SH of degree 4, shared by batches."""
+    given = Inputs(10, degree=2)
+    given.colors = 0.3 * torch.randn(60, (degree + 1) ** 2, 3, dtype=DOUBLE)
+    signals = torch.randn(60, 5, dtype=DOUBLE).requires_grad_()
+    image, _, meta = given.draw(render_mode="RGB+D", sh_degree=degree, extra_signals=signals)
+    assert torch.equal(image, given.draw(render_mode="RGB+D", sh_degree=degree)[0])
+    given.backgrounds = None
+    alone = given.draw(colors=signals, sh_degree=None)[0]
+    assert torch.allclose(meta["render_extra_signals"], alone, atol=1e-12)
+    meta["render_extra_signals"].sum().backward()
+    assert signals.grad.any()
+    away = torch.nn.functional.normalize(given.means - torch.linalg.inv(given.views[0])[:3, 3], dim=1)
+    values = torch.einsum("nk,nkd->nd", sh_basis(degree, away), given.colors) + 0.5
+    of_bands = given.draw(colors=values.clamp_min(0), sh_degree=None)[0]
+    assert torch.allclose(given.draw(sh_degree=degree)[0][0], of_bands[0], atol=1e-12)
+    raw = given.draw(extra_signals=given.colors, extra_signals_sh_degree=degree, sh_degree=degree)[2]
+    assert torch.allclose(raw["render_extra_signals"][0], given.draw(colors=values, sh_degree=None)[0][0], atol=1e-12)
+    for name in ("means", "quats", "scales", "opacities", "views", "Ks"):
+        setattr(given, name, torch.stack([getattr(given, name)] * 2))
+    both = given.draw(sh_degree=degree)[0]
+    assert torch.equal(both[0], both[1]) and torch.allclose(both[0, 0], of_bands[0], atol=1e-12)
+
+
+def test_harmonics_of_any_degree_are_those_of_scipy():
+    away = torch.nn.functional.normalize(torch.randn(20, 3, dtype=DOUBLE), dim=1)
+    x, y, z = away.T.numpy()
+    found, at = sh_basis(6, away), 0
+    for degree in range(7):
+        for order in range(-degree, degree + 1):
+            value = scipy.special.sph_harm_y(degree, abs(order), np.arccos(z), np.arctan2(y, x))
+            wanted = value.real if order == 0 else math.sqrt(2) * (value.real if order > 0 else value.imag)
+            assert np.allclose(found[:, at], wanted, atol=1e-12), (degree, order)
+            at += 1
+
+
+def test_depths_may_be_distances_and_images_depths_alone():
+    given = Inputs(11)
+    alone, _, meta = given.draw(colors=None, render_mode="D", global_z_order=False, packed=False)
+    at = torch.stack([given.means @ view[:3, :3].T + view[:3, 3] for view in given.views])
+    shown = (meta["radii"] > 0).all(-1)
+    assert torch.allclose(meta["depths"][shown], at.norm(dim=-1)[shown])
+    given.colors = given.colors.detach()
+    by_z = given.draw(colors=at[0].norm(dim=-1)[:, None].detach(), backgrounds=None)[0][0]
+    assert (alone[0] - by_z).abs().median() < 1e-3 * by_z.abs().max() and not torch.equal(alone[0], by_z)
+    loss = alone.mean()
+    loss.backward()
+    assert given.means.grad.any()
 
 
 def test_meta_has_what_strategies_read():
@@ -153,6 +307,7 @@ def test_means2d_gets_its_gradient_in_pixels(packed):
     moved = given.views.detach().clone().requires_grad_()
     given.wanted["views"] = given.views = moved
     image, _, meta = given.draw(packed=packed)
+    meta["means2d"].retain_grad()
     image.square().sum().backward()
     # A camera that is moved along x moves all means on the image, and nothing else to first order but their shapes.
     assert torch.allclose(meta["means2d"].grad, gradient)
@@ -226,6 +381,7 @@ def test_no_gaussians_show_the_background(packed):
     given = Inputs(0, count=0)
     image, alpha, meta = given.draw(packed=packed, absgrad=True)
     assert torch.equal(image, given.backgrounds[:, None, None].expand_as(image)) and not alpha.any()
+    meta["means2d"].retain_grad()
     image.sum().backward()
     assert given.means.grad.shape == (0, 3) and meta["means2d"].grad.shape[-2:] == (0, 2)
 
@@ -318,6 +474,17 @@ def test_what_is_not_there_is_refused_by_name(options, words):
         Inputs(0).draw(**options)
 
 
+def test_gsplats_renderers_are_known_by_name():
+    kinds = [type("RendererConfig", (), {})]
+    kinds += [type(f"RendererConfig_{name}", (kinds[0],), {}) for name in ("MixedBatch", "ParallelBatch", "Other")]
+    given = Inputs(0)
+    assert torch.equal(given.draw(renderer_config=kinds[1]())[0], given.draw()[0])
+    wrong = (object(), TypeError), (kinds[2](), ValueError), (kinds[3](), NotImplementedError)
+    for config, error in wrong:
+        with pytest.raises(error, match="renderer_config|RendererConfig_Other"):
+            given.draw(renderer_config=config)
+
+
 def test_strategies_before_1_5_get_one_radius(monkeypatch):
     own = ModuleType("gsplat"), ModuleType("gsplat.rendering")
     own[0].rendering, own[0].__version__ = own[1], "1.4.0"
@@ -334,7 +501,7 @@ def test_parts_of_a_gaussian_follow_the_papers_double_sum():
     opacities, count = torch.tensor([0.3, 0.9, 0.5, 0.99, 0.2], dtype=DOUBLE), torch.tensor([1, 2, 5, 17, 80])
     most = 51
     binoms = torch.tensor([[math.comb(n, k) for k in range(most)] for n in range(most)], dtype=DOUBLE)
-    parts, scales = gsplat_programs.relocated(opacities, torch.ones(5, 3, dtype=DOUBLE), count, binoms)
+    parts, scales = gsplat_programs.relocated(opacities, torch.ones(5, 3, dtype=DOUBLE), count, binoms, 0.0)
     for n, (opacity, number) in enumerate(zip(opacities.tolist(), count.clamp_max(most).tolist(), strict=True)):
         part = 1 - (1 - opacity) ** (1 / number)
         sums = (
@@ -344,6 +511,16 @@ def test_parts_of_a_gaussian_follow_the_papers_double_sum():
         )
         assert parts[n].item() == pytest.approx(part)
         assert scales[n].tolist() == pytest.approx([opacity / math.fsum(sums)] * 3, rel=1e-6)
+    assert gsplat_programs.relocated(opacities, scales, count, binoms)[0].min() == 0.005
+
+
+def test_a_gsplat_that_lacks_something_is_not_replaced(tmp_path, monkeypatch):
+    (tmp_path / "gsplat").mkdir()
+    (tmp_path / "gsplat" / "__init__.py").write_text("import jaxtyping_that_is_not_there\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "gsplat", raising=False)
+    with pytest.raises(ModuleNotFoundError, match="jaxtyping_that_is_not_there"):
+        gsplat_programs.install()
 
 
 @pytest.mark.parametrize("installed", [False, True])

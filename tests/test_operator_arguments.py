@@ -35,7 +35,8 @@ RASTERIZER = (
     "blend_rows",
     "describe",
 )
-RASTERIZER += ("blend_channels", "channel_rows", "camera_vjp", "sum_runs")
+RASTERIZER += ("blend_channels", "channel_moments", "camera_vjp", "sum_runs", "describe_vjp", "pinhole")
+RASTERIZER += ("rasterize_vjp of moments",)
 OTHER_KINDS = ("float16", "int64", "int32", "bool", "complex64", "sparse", "a number")
 OTHER_RANKS, OTHER_COLUMNS = ("one more axis", "is a scalar"), ("no columns", "one column more")
 # Tensors that may be None.
@@ -44,7 +45,7 @@ NEEDLESS += ("places",)
 # Tensors that may be of float64 beside others of float32, or that the dtype is taken from.
 DOUBLE = ("view", "projection", "center", "background", "grad_color", "grad_transmittance", "grad_inverse_depth")
 DOUBLE += ("splats", "rows", "image", "points", "like", "of", "camera[0]", "camera[1]", "camera[2]")
-DOUBLE += ("planes[0]", "planes[1]", "planes[2]")
+DOUBLE += ("planes[0]", "planes[1]", "planes[2]", "pose", "intrinsics")
 
 
 @cache
@@ -203,11 +204,19 @@ WRONG = {
             {"source": _changed(3, lambda t: t + _integers(0, 1, 0))},
         ),
         *((ValueError, f"got {count} of splat 0", _unseen(count)) for count in (1, -1)),
-        (ValueError, "or splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
+        (
+            ValueError,
+            "or splats, tile_counts, and rows and counts or moments, got 2 tensors",
+            {"source": lambda t: t[:2]},
+        ),
     ],
     "sum_blocks": [(ValueError, "sums must have columns", {"sums": lambda t: t[:, :0]})],
     "camera_vjp": [
-        (ValueError, "takes splats, tile_counts, rows and counts, got 3 tensors", {"source": lambda t: t[:3]}),
+        (
+            ValueError,
+            "takes splats, tile_counts, and rows and counts or moments, got 2 tensors",
+            {"source": lambda t: t[:2]},
+        ),
         (ValueError, r"rows must be \(-1, 12\)", {"absolute": True}),
         (ValueError, "there are 5 rows", {"source": _changed(2, lambda t: t[1:])}),
     ],
@@ -260,7 +269,8 @@ WRONG = {
         *((ValueError, "cap must be between 0 and 1", {"cap": cap}) for cap in (0.0, 1.0, float("nan"))),
         (ValueError, r"background must be \(5,\)", {"background": torch.rand(3)}),
     ],
-    "channel_rows": [
+    "rasterize_vjp of moments": [(ValueError, "moments have no absolute gradients", {"absolute": True})],
+    "channel_moments": [
         (ValueError, "cap must be between 0 and 1", {"cap": 1.0}),
         (ValueError, r"channels must be \(3, -1", {"channels": lambda t: t[1:]}),
         (ValueError, r"the gradient of an image must be \(5, 7, 18\)", {"grad_color": lambda t: t[:3]}),

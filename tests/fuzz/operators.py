@@ -36,6 +36,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     shown = [*state[:8], behind, state[9]]
     reach = [rects, counts, integers([[0, 2], [2, 5]])]
     numbered = torch.cat([ops.list_records(*reach)[0], integers([[1], [1], [2]])], 1)
+    moments = ops.channel_moments(shown, values, picture, None, 0.99, True, False, False)[0]
     wanted = [True, True, True, True, True, False, False, True, True]
     source = [splats, counts, *rows]
     sums = list(ops.rasterize_vjp(*scene, wanted, source))
@@ -58,12 +59,20 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "list_records with counts": (ops.list_records, [*reach, numbered, splats, depths, int(numbered[-1].sum())]),
         "sum_runs": (ops.sum_runs, [*rows, rows[1].clamp_max(1), int(rows[1].count_nonzero()), integers([1, 2, 0])]),
         "blend_channels": (ops.blend_channels, [splats, values, instances, ranges, behind, height, width, 0.99]),
-        "channel_rows": (ops.channel_rows, [shown, values, picture, planes[1], 0.99, True, True, True]),
+        "blend_channels last": (
+            ops.blend_channels,
+            [splats, values, instances, ranges, behind, height, width, 0.99, True],
+        ),
+        "channel_moments": (ops.channel_moments, [shown, values, picture, planes[1], 0.99, True, True, True]),
         "describe": (ops.describe, [splats, depths, counts]),
+        "describe packed": (ops.describe, [splats, depths, counts, True]),
+        "describe_vjp": (ops.describe_vjp, [splats, counts, moments]),
+        "pinhole": (ops.pinhole, [torch.eye(4, device=device, dtype=dtype), rand(3, 3), height, width]),
         "blend_rows": (ops.blend_rows, [state, *planes, True]),
         "rasterize": (ops.rasterize, [torch.zeros_like(raw["means"]), *scene, background, True, True]),
         "rasterize_vjp": (ops.rasterize_vjp, [*scene, wanted, state, *planes]),
         "rasterize_vjp of rows": (ops.rasterize_vjp, [*scene, wanted, source]),
+        "rasterize_vjp of moments": (ops.rasterize_vjp, [*scene, wanted, [splats, counts, moments]]),
         "camera_vjp": (ops.camera_vjp, [*scene, source]),
         "sum_blocks": (ops.sum_blocks, [torch.rand(3, 5, device=device, dtype=torch.float64)]),
         "apply_gradients_": (ops.apply_gradients_, [*in_lists, state, planes, [], *step]),

@@ -20,9 +20,8 @@ template <class T>
 struct RowMemory {
   T* (*take)(void* context, int64_t rows);  // as in SplatRows
   void* context;
-  int32_t* counts;      // (N) rows of each splat, filled
-  bool absolute;        // whether rows have what lengths of absolute gradients need
-  T* values = nullptr;  // (N, channels), filled: the gradient of Channels::values, or null
+  int32_t* counts;  // (N) rows of each splat, filled
+  bool absolute;    // whether rows have what lengths of absolute gradients need
 };
 
 // Every backend's functions. `Where` says how they run: an Executor on the CPU, a Queue on a GPU.
@@ -38,9 +37,8 @@ struct RowMemory {
   void blend(const Where&, const BlendInput<T>&, const Blended<T>&);                                 \
   template <class T>                                                                                 \
   void blend_vjp(const Where&, const BlendInput<T>&, const BlendGradient<T>&);                       \
-  /* The rows of the processed instances, which blend_vjp sums. No gradient's output is written. Of  \
-     channels the first three are in the rows, as a colour, and on a GPU there may be more rows than \
-     those of all splats, which come first. */                                                       \
+  /* The rows of the processed instances, which blend_vjp sums, of colours. No gradient's output is  \
+     written. */                                                                                     \
   template <class T>                                                                                 \
   void blend_rows(const Where&, const BlendInput<T>&, const BlendGradient<T>&, const RowMemory<T>&); \
   template <class T>                                                                                 \
@@ -72,6 +70,12 @@ template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
 template <class T>
 void describe(const Executor&, const DescribeInput<T>&, const Descriptions<T>&);
+// Writes the numbers of the splats that have tiles, ascending. Returns how many there are.
+int64_t list_shown(const Executor&, int64_t count, const int32_t* tile_counts, int64_t* rows);
+template <class T>
+void describe_vjp(const Executor&, const DescribedInput<T>&, const DescribedGradient<T>&);
+template <class T>
+void pinhole(const Executor&, const T* pose, const T* intrinsics, Image, const PinholeMatrices<T>&);
 template <class T>
 void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
 
@@ -104,6 +108,11 @@ void count_records(const Queue&, const RecordInput&, int32_t* counts);
 void list_records(const Queue&, const RecordInput&, const RecordLists<float>&);
 void sum_runs(const Queue&, const SumInput<float>&);
 void describe(const Queue&, const DescribeInput<float>&, const Descriptions<float>&);
+int64_t list_shown(const Queue&, int64_t count, const int32_t* tile_counts, int64_t* rows);
+void describe_vjp(const Queue&, const DescribedInput<float>&, const DescribedGradient<float>&);
+// In float64 as well.
+template <class T>
+void pinhole(const Queue&, const T* pose, const T* intrinsics, Image, const PinholeMatrices<T>&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);
@@ -122,8 +131,10 @@ void rows_vjp_step(const Queue&, const Scene<float>&, const SplatRows<float>&, c
 // From the same rows, which it only reads, to what blocks add to the gradients of the camera's numbers, as on the CPU;
 // and the sums over blocks.
 void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, double* sums);
+void camera_vjp(const Queue&, const Scene<float>&, const int32_t* tile_counts, const float* moments, double* sums);
 void sum_blocks(const Queue&, int64_t blocks, int64_t numbers, const double* sums, double* out);
 }  // namespace cuda
+using cuda::describe, cuda::describe_vjp, cuda::list_shown, cuda::pinhole;
 using cuda::observe, cuda::displace, cuda::elementary, cuda::random_words, cuda::count_records;
 
 }  // namespace gs

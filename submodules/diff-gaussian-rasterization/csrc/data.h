@@ -164,6 +164,8 @@ struct Channels {
   int64_t stride = 0, count = 0;  // 0: splats show colours
   T cap = 0;                      // the largest alpha
   bool stops = false;             // whether a gradient ends at the cap
+  // Of an image and of its gradient: values from a channel to the next, and from a pixel to the next.
+  int64_t plane = 0, pixel = 1;
 
   const T* of(int64_t splat) const { return values + stride * splat; }
 };
@@ -185,18 +187,18 @@ struct BlendInput {
 
 template <class T>
 struct Blended {
-  T* color;          // (C, H, W)
-  T* transmittance;  // (H, W)
-  T* inverse_depth;  // (H, W), or null
-  int32_t* last;     // (H, W) 1 + position in the tile's list of the last splat blended, or null
-  T* layers;         // math/layers.h, for the backward; null allowed, and on the CPU
+  T* color;            // (C, H, W)
+  T* transmittance;    // (H, W)
+  T* inverse_depth;    // (H, W), or null
+  int32_t* last;       // (H, W) 1 + position in the tile's list of the last splat blended, or null
+  T* layers;           // math/layers.h, for the backward; null allowed, and on the CPU
+  T* alpha = nullptr;  // (H, W) of channels: 1 - transmittance; or null
 };
 
 // Blending takes so many channels at once; of more, there are several passes.
 constexpr int kMostChannels = 32;
 
-// Calls run(first, pass, plane) for each pass over channels: where its channels begin, and where its planes of an
-// image do.
+// Calls run(first, pass, begin) for each pass over channels: where its channels begin, and where they do in an image.
 template <class T, class Run>
 void each_pass(const BlendInput<T>& in, const Run& run) {
   for (int64_t first = 0; first < in.channels.count; first += kMostChannels) {
@@ -204,7 +206,7 @@ void each_pass(const BlendInput<T>& in, const Run& run) {
     BlendInput<T> pass = in;
     pass.background += first, pass.channels.values += first;
     pass.channels.count = left < kMostChannels ? left : kMostChannels;
-    run(first, pass, first * in.image.width * in.image.height);
+    run(first, pass, first * in.channels.plane);
   }
 }
 
@@ -221,6 +223,10 @@ struct BlendGradient {
   const T* layers = nullptr;     // Blended::layers, or null: then blend_vjp makes its own
   const Ahead* ahead = nullptr;  // on a GPU: take room for gradient rows, and do not wait for their number
   T* absolute = nullptr;         // out: (N), absolute_length in math/absolute.h; or null
+  T* values = nullptr;           // out: (N, channels), of Channels::values; or null
+
+  // Up to three channels are in the moments, in place of a colour.
+  bool values_apart(const Channels<T>& channels) const { return values && channels.count > 3; }
 };
 
 // Gradient rows that lie by splat: those of a splat side by side, in the order of its slots.
@@ -330,10 +336,12 @@ struct RecordLists {
 constexpr int64_t kRecordBlock = 256;
 constexpr int64_t record_blocks(int64_t count) { return (count + kRecordBlock - 1) / kRecordBlock; }
 
-// Splats to be described (math/describe.h), rows of `row` values.
+// Splats to be described (math/gsplat.h), rows of `row` values: `count` of them, by `rows`, or the first ones if it is
+// null, here and below.
 template <class T>
 struct DescribeInput {
   int64_t count;
+  const int64_t* rows;
   int row;
   const T *splats, *depths;
   const int32_t* tile_counts;
@@ -345,6 +353,27 @@ struct Descriptions {
   T* depths;       // (N)
   T* conics;       // (N, 3) xx xy yy of the inverse covariance
   T* opacities;    // (N)
+  int32_t* tiles;  // (N), or null
+};
+
+// Moments of the splats' exponents (BlendGradient), and the gradients that they are.
+template <class T>
+struct DescribedInput {
+  int64_t count;
+  const int64_t* rows;
+  int row;  // values of a splat's row, and of its moments'
+  const T *splats, *moments;
+  const int32_t* tile_counts;
+};
+template <class T>
+struct DescribedGradient {
+  T *centers, *conics, *opacities;  // (N, 2), (N, 3), (N)
+};
+
+// A pinhole's view and full projection, both transposed, and its centre: Scene::view and what follows.
+template <class T>
+struct PinholeMatrices {
+  T *view, *full, *center;
 };
 
 // Runs of rows that lie side by side, some of which become one row each, the sum of theirs.

@@ -5,20 +5,18 @@ The kernels blend up to 32 channels at once. Projection and sorting are computed
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.camera import camera_numbers
 from diff_gaussian_rasterization.checks import check_finite, check_tensors
-from diff_gaussian_rasterization.first_order import first_order
+from diff_gaussian_rasterization.first_order import needs_function
 from diff_gaussian_rasterization.gaussians import Gaussians, lists_gaussians
-from diff_gaussian_rasterization.scene import Scene, scene_arguments
+from diff_gaussian_rasterization.scene import scene_arguments
 from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
+from diff_gaussian_rasterization.stages import Blending, Shared, blended, projected
 
 MOST_CHANNELS = 32  # that are blended at once: kMostChannels in csrc/data.h
 _MOST_ALPHA = 0.99  # kMaxAlpha in csrc/math/constants.h
-_GAUSSIANS = len(Gaussians._fields)
 
 
 class ChannelImage(NamedTuple):
@@ -30,15 +28,6 @@ class ChannelImage(NamedTuple):
     splats: Tensor  # (N, 10 or more): mean (px), factor of the conic, log2 of the opacity; see `Splat` in csrc/math
     depths: Tensor  # (N,) along the axis of the view; of fisheyes and panoramas the distance
     tile_counts: Tensor  # (N,) int32, tiles that each Gaussian reaches
-
-
-class _Blending(NamedTuple):
-    """How alphas are blended, and what else is wanted."""
-
-    cap: float  # the largest alpha
-    stops: bool  # whether gradients end there
-    colored: bool  # whether colours come before the features
-    absolute: bool  # whether absolute gradients are wanted
 
 
 @lists_gaussians
@@ -77,7 +66,7 @@ def rasterize_channels(
     if not count:
         raise ValueError("features must have a channel where neither colours nor SH are given")
     if not colored:
-        gaussians = gaussians._replace(colors=means.new_zeros(len(means), 3))  # projection asks for a colour
+        gaussians = gaussians._replace(colors=means.detach())  # projection asks for some; nothing shows them
     if want_absolute_gradient and count > MOST_CHANNELS:
         raise ValueError(f"absolute gradients need at most {MOST_CHANNELS} channels, got {count}")
     if settings.projection == "ray" and settings.lens is not None:
@@ -87,10 +76,17 @@ def rasterize_channels(
     background = settings.bg.to(means).reshape(-1)
     if len(background) not in (1, count):
         raise ValueError(f"the background must have {count} values, or one for all, got {len(background)}")
-    blending = _Blending(most_alpha or _MOST_ALPHA, most_alpha is not None, colored, want_absolute_gradient)
     scene = scene_arguments(gaussians, settings, 1 if raw else 2 * any_rotation)
-    camera = camera_numbers(scene, settings)
-    return ChannelImage(*_Channels.apply(blending, depths, camera, means2d, features, background, *scene))
+    stops = most_alpha is not None
+    how = Blending(scene.size, most_alpha if stops else _MOST_ALPHA, stops, colored, want_absolute_gradient)
+    shared, camera = Shared(), camera_numbers(scene, settings)
+    splats, own_depths, rects, tile_counts, radii = projected(shared, camera, means2d, *scene)
+    order = own_depths.detach() if depths is None else depths
+    lists = order, rects, tile_counts, None
+    own = None if colored and not features.shape[1] else features
+    train = splats.requires_grad or needs_function(features, background)
+    image, transmittance, *_ = blended(shared, how, train, *lists, splats, None, None, None, None, own, background)
+    return ChannelImage(image, transmittance, radii, splats.detach(), own_depths.detach(), tile_counts)
 
 
 def _check(
@@ -109,51 +105,3 @@ def _check(
         for name, values in given.items():
             if values is not None:
                 check_finite(name, values)
-
-
-class _Channels(torch.autograd.Function):
-    """Inputs: `_Blending`, depths, the camera's numbers, means2d, features, the background, and `Scene`'s."""
-
-    @staticmethod
-    def forward(ctx, blending, order, camera, means2d, features, background, *scene):
-        with torch._C._AutoDispatchBelowAutograd():
-            given = Scene(*scene)
-            splats, depths, rects, tile_counts, radii = OPERATORS.project(*given)
-            lists = OPERATORS.bin(splats, depths if order is None else order, rects, tile_counts, *given.size, True)
-            values = torch.cat([splats[:, 6:9], features], 1) if blending.colored else features
-            behind = background.expand(values.shape[1])
-            image, transmittance, last = OPERATORS.blend_channels(
-                splats, values, *lists[:2], behind, *given.size, blending.cap
-            )
-        ctx.blending, ctx.numbers, ctx.background = blending, scene[11:], background.shape
-        ctx.set_materialize_grads(False)
-        kept = splats, tile_counts, *lists, last, splats.new_zeros(0), behind, transmittance
-        ctx.save_for_backward(*scene[:11], values, *kept)
-        ctx.mark_non_differentiable(radii, splats, depths, tile_counts)
-        return image, transmittance, radii, splats, depths, tile_counts
-
-    @staticmethod
-    @first_order("rasterize_channels")
-    def backward(ctx, grad_image, grad_transmittance, *_):
-        blending, needed = ctx.blending, ctx.needs_input_grad
-        scene, values, kept = (*ctx.saved_tensors[:11], *ctx.numbers), ctx.saved_tensors[11], ctx.saved_tensors[12:]
-        splats, tile_counts, last, transmittance = kept[0], kept[1], kept[6], kept[9]
-        if grad_image is None:
-            grad_image = splats.new_zeros(values.shape[1], *last.shape)
-        rows, counts, of_values = OPERATORS.channel_rows(
-            kept, values, grad_image, grad_transmittance, blending.cap, blending.stops, blending.absolute, needed[4]
-        )
-        source, results = (splats, tile_counts, rows, counts), [None] * len(needed)
-        if needed[2]:
-            results[2] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, source, blending.absolute))
-        if needed[4]:
-            results[4] = of_values[:, 3:] if blending.colored else of_values
-        if needed[5]:
-            results[5] = torch.mv(grad_image.flatten(1), transmittance.flatten()).sum_to_size(ctx.background)
-        places = [3, *range(6, 6 + _GAUSSIANS)]
-        wanted = [needed[at] for at in places]
-        if any(wanted):
-            gradients = OPERATORS.rasterize_vjp(*scene, wanted, source, None, None, None, blending.absolute)
-            for at, gradient in zip(places, gradients, strict=True):
-                results[at] = gradient if needed[at] else None
-        return tuple(results)

@@ -79,25 +79,38 @@ def _(source, *arguments):
 
 
 @_fake("blend_channels")
-def _(splats, channels, instances, ranges, background, height, width, cap):
-    image = splats.new_empty((channels.shape[1], height, width))
-    return image, splats.new_empty((1, height, width)), splats.new_empty((height, width), dtype=torch.int32)
+def _(splats, channels, instances, ranges, background, height, width, cap, channels_last=False):
+    image = (1, height, width, channels.shape[1]) if channels_last else (channels.shape[1], height, width)
+    last, alpha = splats.new_empty((height, width), dtype=torch.int32), (1, height, width, 1) if channels_last else (0,)
+    return splats.new_empty(image), splats.new_empty((1, height, width)), last, splats.new_empty(alpha)
 
 
-@_fake("channel_rows")
-def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wanted):
+@_fake("channel_moments")
+def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wanted, channels_last=False):
     splats = source[0]
-    values = splats.shape[1] - SPLAT_VALUES + MOMENT_VALUES + absolute * ABSOLUTE_VALUES
-    rows = splats.new_empty((library.get_ctx().new_dynamic_size(), values))
-    counts = splats.new_empty((splats.shape[0],), dtype=torch.int32)
-    return rows, counts, splats.new_empty((splats.shape[0] if wanted else 0, channels.shape[1]))
+    count = splats.shape[0]
+    lengths = splats.new_empty((count if absolute else 0,))
+    return torch.empty_like(splats), lengths, splats.new_empty((count if wanted else 0, channels.shape[1]))
+
+
+@_fake("describe_vjp")
+def _(splats, tile_counts, moments, rows=None):
+    count = (splats if rows is None else rows).shape[0]
+    return tuple(splats.new_empty((count, *row)) for row in ((2,), (3,), ()))
+
+
+@_fake("pinhole")
+def _(pose, intrinsics, height, width):
+    return pose.new_empty((4, 4)), pose.new_empty((4, 4)), pose.new_empty((3,))
 
 
 @_fake("describe")
-def _(splats, depths, tile_counts):
-    count = splats.shape[0]
+def _(splats, depths, tile_counts, packed=False):
+    count = library.get_ctx().new_dynamic_size() if packed else splats.shape[0]
     floats = (splats.new_empty((count, *row)) for row in ((2,), (), (3,), ()))
-    return splats.new_empty((count, 2), dtype=torch.int32), *floats
+    listed = (count if packed else 0,)
+    radii, tiles = (splats.new_empty(shape, dtype=torch.int32) for shape in ((count, 2), listed))
+    return radii, *floats, tiles, splats.new_empty(listed, dtype=torch.int64)
 
 
 @_fake("rasterize_vjp")

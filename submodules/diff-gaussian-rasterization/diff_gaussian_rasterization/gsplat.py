@@ -1,4 +1,4 @@
-"""gsplat's function `rasterization`, in the form of its version 1.5.3, on this rasterizer: CPU and CUDA.
+"""gsplat's function `rasterization`, in the form of its version 1.6, on this rasterizer: CPU and CUDA.
 
     from diff_gaussian_rasterization.gsplat import rasterization
     python -m diff_gaussian_rasterization.gsplat PROGRAM.py [OPTION...]    # runs a program whose gsplat is this one
@@ -6,20 +6,25 @@
 Names, order, defaults, shapes and results are gsplat's; what it does not have is refused by name.
 """
 
+import contextlib
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from collections.abc import Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.weak import TensorWeakRef
 
 from diff_gaussian_rasterization.alternatives import MOST_BANDS, MOST_DEGREE
 from diff_gaussian_rasterization.backend import OPERATORS
-from diff_gaussian_rasterization.channels import rasterize_channels
+from diff_gaussian_rasterization.channels import MOST_CHANNELS
 from diff_gaussian_rasterization.checks import check_tensors, whole_number
+from diff_gaussian_rasterization.first_order import needs_function
+from diff_gaussian_rasterization.gsplat_meta import Meta
+from diff_gaussian_rasterization.harmonics import sh_values
 from diff_gaussian_rasterization.lens import Lens
-from diff_gaussian_rasterization.settings import GaussianRasterizationSettings
+from diff_gaussian_rasterization.stages import Blending, Shared, blended, described, projected
 
 MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 _CHOICES = {
@@ -30,17 +35,21 @@ _CHOICES = {
 _ENDLESS = 1e10  # far_plane, if nobody gives one
 _MOST_ALPHA = 0.999
 _FLAT = 2.0**-40  # of depth
+_TILE = 16  # px
+_NO_CONTEXT = contextlib.nullcontext()
+_NUMBERS = {False: 10, True: 19}  # of a camera beyond its pose (camera.py), of a pinhole and of a lens
 _NO_UT = "take camera_model='fisheye', or a Lens with rasterize_channels"
+_NO_RAYS = "take projection='ray' with rasterize"
 _UNSUPPORTED = {
     "distributed": "train with torchrun and train.py",
-    "with_ut": _NO_UT,
-    "with_eval3d": "take projection='ray' with rasterize",
+    **dict.fromkeys(("with_eval3d", "return_normals", "rays"), _NO_RAYS),
     **dict.fromkeys(
-        ("radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs", "viewmats_rs"), _NO_UT
+        ("with_ut", "ut_params", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
+         "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs"), _NO_UT,
     ),
-}
-_NEEDED = {"means": "(..., N, 3)", "colors": "(..., N, D)", "viewmats": "(..., C, 4, 4)"}
-_OTHERS = ("quats", "scales", "opacities", "Ks", "backgrounds", "covars")
+}  # fmt: skip
+_NEEDED = {"means": "(..., N, 3)", "viewmats": "(..., C, 4, 4)"}
+_OTHERS = ("quats", "scales", "opacities", "colors", "Ks", "backgrounds", "covars", "extra_signals")
 
 
 class _Fisheye(Lens):
@@ -51,71 +60,53 @@ class _Fisheye(Lens):
         return chart, (math.pi / 2) ** 2, reach, math.pi / 2, *rest
 
 
-class _Camera(NamedTuple):
-    """One camera of a call."""
+class _Call(NamedTuple):
+    """What all images of a call share."""
 
-    view: Tensor  # (4, 4) world to view
-    K: Tensor  # (3, 3)
-    width: int
-    height: int
-    model: str
+    size: tuple[int, int]  # height, width
+    degree: int | None  # of SH
+    signal_degree: int | None
+    colored: bool  # whether colours are shown, and below, whether depths are
+    deep: bool
+    mean_depth: bool  # depths over alpha
+    antialiased: bool
+    eps2d: float  # px^2
+    clip: float  # px
     near: float
     far: float
-
-    def settings(
-        self, degree: int | None, antialiased: bool, dilation: float, background: Tensor
-    ) -> GaussianRasterizationSettings:
-        """The settings, differentiable in `view`. Of a pinhole no number goes to the host, which would wait for it."""
-        view, width, height = self.view.double(), self.width, self.height
-        center = torch.linalg.inv_ex(view)[0][:3, 3] if degree else view[:3, 3]  # SH of degree 0 have no direction
-        lens, near = None, self.near
-        if self.model != "pinhole":
-            fx, _, cx, _, fy, cy, *_ = self.K.flatten().tolist()
-            lens = (_Fisheye if self.model == "fisheye" else Lens)(
-                "equidistant" if self.model == "fisheye" else "perspective", (fx, fy), (cx - 0.5, cy - 0.5)
-            )
-        if self.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
-            view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
-        kept, last, clip = _of_pixels(width, height, view.device)
-        full = view[:3].T @ torch.addcmul(last, self.K.double(), kept).T @ clip
-        matrices = torch.cat([view.T.flatten(), full.flatten(), center]).to(self.view.dtype)
-        return GaussianRasterizationSettings(
-            height, width, 0.0, 0.0, background, 1.0, matrices[:16].view(4, 4), matrices[16:32].view(4, 4),
-            degree or 0, matrices[32:], False, False, antialiased, lens=lens, dilation=dilation, near=near,
-        )  # fmt: skip
+    model: str
+    by_z: bool  # depths are along the axis, else distances
+    packed: bool
+    absgrad: bool
 
 
-@lru_cache
-def _of_pixels(width: int, height: int, device: torch.device) -> list[Tensor]:
-    """What K makes a projection with: its entries that count (3, 3), as in gsplat, and the others.
-
-    Then from pixels times depth to clip coordinates, transposed (3, 4).
-    """
-    clip = [[2 / width, 0, 0, 0], [0, 2 / height, 0, 0], [-1, -1, 1, 1]]
-    kept, last = [[1, 0, 1], [0, 1, 1], [0, 0, 0]], [[0, 0, 0], [0, 0, 0], [0, 0, 1]]
-    return [torch.tensor(rows, dtype=torch.float64, device=device) for rows in (kept, last, clip)]
-
-
-class _Rows(NamedTuple):
-    """The N Gaussians of an image."""
+class _Item(NamedTuple):
+    """The Gaussians and the camera of an image."""
 
     means: Tensor
     quats: Tensor | None
     scales: Tensor | None
+    covars: Tensor | None  # (N, 6)
     opacities: Tensor
-    covars: Tensor | None
-    colors: Tensor  # (N, D), or SH (N, K, 3)
+    colors: Tensor | None  # (N, D), or SH (N, K, D)
+    signals: Tensor | None  # the same
+    view: Tensor  # (4, 4) world to view
+    K: Tensor  # (3, 3)
+    background: Tensor | None  # (D,)
 
 
-class _Options(NamedTuple):
-    """How to draw them."""
+class _Projection(NamedTuple):
+    """The splats of an image, and what they show."""
 
-    degree: int | None  # of SH
-    mode: str
-    antialiased: bool
-    dilation: float  # px^2
-    absgrad: bool
-    clip: float  # px
+    shared: Shared
+    splats: Tensor
+    colored: bool  # whether they have colours
+    features: Tensor | None  # (N, F): colours that they do not have, then signals
+    order: Tensor  # (N,) depths
+    rects: Tensor
+    tile_counts: Tensor
+    notes: tuple[Tensor, ...]  # of `described`, without the rows
+    rows: Tensor | None  # that are shown, if they are packed
 
 
 class _Sparse(torch.autograd.Function):
@@ -132,38 +123,12 @@ class _Sparse(torch.autograd.Function):
         return torch.sparse_coo_tensor(rows[None], gradient[rows], gradient.shape, check_invariants=False), None
 
 
-def _sparse(given: tuple[Tensor | None, ...], shown: list[Tensor], packed: bool) -> Iterator[Tensor | None]:
-    if not packed or given[0].dim() != 2:
-        raise ValueError("sparse_grad needs packed=True, and no batches")
-    return (None if values is None else _Sparse.apply(values, shown) for values in given)
-
-
-class _Described(NamedTuple):
-    """What gsplat tells of the N Gaussians of an image; zeros where they are not shown."""
-
-    radii: Tensor  # (N, 2) int32, px
-    means2d: Tensor  # (N, 2) px, pixel centres at halves
-    depths: Tensor  # (N,)
-    conics: Tensor  # (N, 3): xx, xy, yy of the inverse covariance
-    opacities: Tensor  # (N,), of antialiased ones with their factor
-    tiles: Tensor  # (N,) int32
-
-
-class _Drawn(NamedTuple):
-    """An image, and what the notes need of it."""
-
-    image: Tensor  # (H, W, D)
-    alpha: Tensor  # (H, W, 1)
-    found: _Described
-    probe: Tensor  # (N, 3), which gets the gradient of the means on the image, in NDC
-
-
 def rasterization(
     means: Tensor,
     quats: Tensor | None,
     scales: Tensor | None,
     opacities: Tensor,
-    colors: Tensor,
+    colors: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -174,7 +139,7 @@ def rasterization(
     eps2d: float = 0.3,
     sh_degree: int | None = None,
     packed: bool = True,
-    tile_size: int = 16,
+    tile_size: int | None = None,
     backgrounds: Tensor | None = None,
     render_mode: str = "RGB",
     sparse_grad: bool = False,
@@ -187,224 +152,345 @@ def rasterization(
     covars: Tensor | None = None,
     with_ut: bool = False,
     with_eval3d: bool = False,
+    return_normals: bool = False,
+    global_z_order: bool = True,
+    rays: Tensor | None = None,
     radial_coeffs: Tensor | None = None,
     tangential_coeffs: Tensor | None = None,
     thin_prism_coeffs: Tensor | None = None,
     ftheta_coeffs: Any = None,
+    lidar_coeffs: Any = None,
+    external_distortion_coeffs: Any = None,
     rolling_shutter: Any = None,
     viewmats_rs: Tensor | None = None,
+    ut_params: Any = None,
+    extra_signals: Tensor | None = None,
+    extra_signals_sh_degree: int | None = None,
+    renderer_config: Any = None,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Renders N Gaussians with C cameras, and leading batch dimensions, as gsplat 1.5.3 does.
+    """Renders N Gaussians with C cameras, and leading batch dimensions, as gsplat 1.6 does.
 
     means (..., N, 3); quats (..., N, 4): w x y z, any length; scales (..., N, 3); or covars (..., N, 3, 3) for both;
-    opacities (..., N). colors (..., N, D) or (..., C, N, D); with sh_degree, at most 3, SH (..., N, K, 3) or
-    (..., C, N, K, 3). viewmats (..., C, 4, 4): world to view, differentiable. Ks (..., C, 3, 3): no gradient.
-    near_plane, far_plane: depths that are shown. radius_clip (px): smaller Gaussians are left out. eps2d (px^2): added
-    to variances, 0 to 1. backgrounds (..., C, D), or packed (D,). render_mode: D is the sum of weights times depth, ED
-    is D over alpha. sparse_grad: gradients of means, quats and scales are sparse. absgrad: meta["means2d"].absgrad, of
-    at most 32 channels; x has the length of x and y in NDC, times 2 / width, and y is 0. Returns images (..., C, H, W,
-    D), alphas (..., C, H, W, 1), and meta, whose means2d gets a `grad` (px). ValueError: what cannot be drawn.
+    opacities (..., N). colors, extra_signals (..., N, D) or (..., C, N, D), or with a degree SH (N, K, D), perhaps of
+    each batch or camera. viewmats (..., C, 4, 4): world to view, differentiable. Ks (..., C, 3, 3): no gradient.
+    radius_clip (px): smaller Gaussians are left out. eps2d (px^2): added to variances, 0 to 1. backgrounds (..., C, D),
+    or packed (D,). render_mode: D is the sum of weights times depth, ED is D over alpha. global_z_order: depths are
+    along the axis, else distances. sparse_grad: gradients of means, quats and scales are sparse. absgrad:
+    meta["means2d"].absgrad, of at most 32 channels; x has the length of x and y in NDC, times 2 / width, and y is 0.
+    Returns images (..., C, H, W, D), alphas (..., C, H, W, 1), and meta. ValueError: what cannot be drawn.
     """
-    width, height, tile_size, backgrounds = _checked(locals())
-    given = means, quats, scales, opacities, covars, colors, viewmats, Ks, backgrounds
+    call, backgrounds, tile = _checked(locals())
+    given = _Item(means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds)
+    with _without_autocast(means.device.type):  # whose products of matrices are of 8 or 11 bits
+        return _rendered(call, given, tile, sparse_grad)
+
+
+def _without_autocast(device: str) -> contextlib.AbstractContextManager:
+    return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else _NO_CONTEXT
+
+
+def _rendered(call: _Call, given: _Item, tile: int, sparse: bool) -> tuple[Tensor, Tensor, Meta]:
     shown: list[Tensor] = []
-    given = (*_sparse(given[:3], shown, packed), *given[3:]) if sparse_grad else given
-    form = *means.shape[:-2], viewmats.shape[-3] if viewmats.dim() > 2 else 1
-    options = _Options(sh_degree, render_mode, rasterize_mode == "antialiased", eps2d, absgrad, radius_clip)
-    frame = width, height, camera_model, near_plane, far_plane
-    with torch.autocast(means.device.type, enabled=False):  # its products of matrices are of 8 or 11 bits
-        images = _images(*given, form[-1], sh_degree is not None)
-        drawn = [_render(_Camera(*view, *frame), rows, background, options) for rows, view, background in images]
-    meta = _meta(drawn, form, (width, height), tile_size, packed, absgrad)
-    shown += [meta["gaussian_ids"]]
-    return *(_together([one[at].contiguous() for one in drawn], form) for at in (0, 1)), meta
+    if sparse:
+        if not call.packed or given.means.dim() != 2:
+            raise ValueError("sparse_grad needs packed=True, and no batches")
+        rows = {name: getattr(given, name) for name in ("means", "quats", "scales")}
+        given = given._replace(**{name: None if t is None else _Sparse.apply(t, shown) for name, t in rows.items()})
+    form = *given.means.shape[:-2], given.view.shape[-3] if given.view.dim() > 2 else 1
+    items = _items(call, given, form)
+    projections = [_project(call, item) for item in items]
+    notes, pieces = _joined(call, [one.notes for one in projections], form)
+    drawn = [_blend(call, *one) for one in zip(items, projections, pieces, strict=True)]
+    lists = [(*one[3], projection.order) for one, projection in zip(drawn, projections, strict=True)]
+    meta = _meta(call, notes, lists, projections, form, tile)
+    if given.signals is not None:
+        meta["render_extra_signals"] = _together([one[2] for one in drawn], form)
+    shown += [meta["gaussian_ids"]] * sparse
+    image, alpha = (_together([one[at] for one in drawn], form) for at in (0, 1))
+    return image, alpha, meta
 
 
 def _together(parts: Sequence[Tensor], form: tuple[int, ...]) -> Tensor:
-    """Tensors of all images as one."""
-    return parts[0][None] if form == (1,) else torch.stack(parts).unflatten(0, form)
+    """Tensors (1, ...) of all images as one."""
+    whole = parts[0] if len(parts) == 1 else torch.cat(tuple(parts))
+    return whole if len(form) == 1 else whole.unflatten(0, form)
 
 
-def _images(
-    means: Tensor,
-    quats: Tensor | None,
-    scales: Tensor | None,
-    opacities: Tensor,
-    covars: Tensor | None,
-    colors: Tensor,
-    viewmats: Tensor,
-    Ks: Tensor,
-    backgrounds: Tensor | None,
-    cameras: int,
-    harmonics: bool,
-) -> Iterator[tuple[_Rows, tuple[Tensor, Tensor], Tensor | None]]:
-    """For each image the Gaussians, the first fields of `_Camera`, and the background. ValueError for wrong inputs."""
-    batch, count = means.shape[:-2], means.shape[-2]
-    if not (cameras and all(batch)):
-        raise ValueError(f"there must be an image to render, got batches and cameras {(*batch, cameras)}")
-    each = colors.dim() - len(batch) == 3 + harmonics  # colours of their own for each camera
-    shapes = {
-        "means": (means, (count, 3)),
-        "opacities": (opacities, (count,)),
-        "viewmats": (viewmats, (cameras, 4, 4)),
-        "Ks": (Ks, (cameras, 3, 3)),
-        "colors": (colors, ((cameras,) if each else ()) + (count, *colors.shape[-1 - harmonics :])),
-    }
-    if covars is None:
-        shapes |= {"quats": (quats, (count, 4)), "scales": (scales, (count, 3))}
-    else:
-        shapes |= {"covars": (covars, (count, 3, 3))}
-        quats = scales = None
-    if backgrounds is not None:
-        shapes |= {"backgrounds": (backgrounds, (cameras, *backgrounds.shape[-1:]))}
-    for name, (values, shape) in shapes.items():
-        if values is None or values.shape != batch + shape:
-            found = None if values is None else tuple(values.shape)
-            raise ValueError(f"{name} must be {tuple(batch + shape)}, got {found}")
-        if values.dtype != means.dtype and name not in ("Ks", "backgrounds"):
-            raise ValueError(f"{name} must be {means.dtype} like means, got {values.dtype}")
-
-    def item(values: Tensor | None, axes: int, at: int) -> Tensor | None:
-        if values is None or not batch:
-            return values
-        return values.reshape(batches, *values.shape[values.dim() - axes :])[at]
-
-    batches = math.prod(batch)
-    for at in range(batches):
-        rows = [(means, 2), (quats, 2), (scales, 2), (opacities, 1), (covars, 3)]
-        own = [item(values, axes, at) for values, axes in rows]
-        shown, behind = item(colors, 2 + harmonics + each, at), item(backgrounds, 2, at)
-        views, intrinsics = item(viewmats, 3, at), item(Ks.detach().to(means.device), 3, at)
-        for n in range(cameras):
-            camera = views[n], intrinsics[n]
-            yield _Rows(*own, shown[n] if each else shown), camera, None if behind is None else behind[n]
-
-
-def _checked(given: dict[str, Any]) -> tuple[int, int, int, Tensor | None]:
-    """Width, height, tile_size and backgrounds of the arguments of `rasterization`. ValueError for wrong arguments."""
+def _checked(given: dict[str, Any]) -> tuple[_Call, Tensor | None, int]:
+    """The arguments of `rasterization`, backgrounds and tile_size apart. ValueError, or TypeError, for wrong ones."""
     for name, remedy in _UNSUPPORTED.items():
-        if isinstance(given[name], Tensor) or given[name]:
+        if given[name] is not None and given[name] is not False:
             raise ValueError(f"{name} is not supported; {remedy}")
-    shutter, degree, eps2d = given["rolling_shutter"], given["sh_degree"], given["eps2d"]
+    _check_renderer(given["renderer_config"])
+    shutter, eps2d, mode = given["rolling_shutter"], given["eps2d"], given["render_mode"]
     check_tensors({name: given[name] for name in (*_NEEDED, *_OTHERS)})
     for name, shape in _NEEDED.items():
         if (found := given[name]) is None or found.dim() < 2:
             raise ValueError(f"{name} must be {shape}, got {None if found is None else tuple(found.shape)}")
     if shutter is not None and getattr(shutter, "name", "GLOBAL") != "GLOBAL":
         raise ValueError("rolling_shutter is not supported; take poses of a global shutter")
+    if mode in ("d", "Ed", "RGB-d", "RGB-Ed"):
+        raise ValueError(
+            f"render_mode {mode!r} needs with_eval3d, which is not supported; take {mode.upper()!r}".replace("-", "+")
+        )
     for name, choices in _CHOICES.items():
         if given[name] not in choices:
             raise ValueError(f"{name} must be one of {', '.join(choices)}, got {given[name]!r}")
     if not 0 <= eps2d <= 1:
         raise ValueError(f"eps2d must be 0 to 1 px^2, got {eps2d}")
-    if degree is not None and whole_number("sh_degree", degree, 0) > MOST_DEGREE:
-        raise ValueError(f"sh_degree must be 0 to {MOST_DEGREE}, got {degree}")
-    behind = given["backgrounds"]
+    degrees = [
+        None if given[name] is None else whole_number(name, given[name], 0)
+        for name in ("sh_degree", "extra_signals_sh_degree")
+    ]
+    behind, means = given["backgrounds"], given["means"]
     if given["packed"] and behind is not None and behind.dim() == 1:  # gsplat's rows that are packed have no cameras
-        behind = behind.expand(*given["means"].shape[:-2], *given["viewmats"].shape[-3:-2], -1)
-    return *(whole_number(name, given[name]) for name in ("width", "height", "tile_size")), behind
+        behind = behind.expand(*means.shape[:-2], *given["viewmats"].shape[-3:-2], -1)
+    width, height = (whole_number(name, given[name]) for name in ("width", "height"))
+    tile = _TILE if given["tile_size"] is None else whole_number("tile_size", given["tile_size"])
+    call = _Call(
+        (height, width), *degrees, mode.startswith("RGB"), mode.endswith("D"), mode.endswith("ED"),
+        given["rasterize_mode"] == "antialiased", float(eps2d), given["radius_clip"], float(given["near_plane"]),
+        given["far_plane"], given["camera_model"], bool(given["global_z_order"]), bool(given["packed"]),
+        bool(given["absgrad"]),
+    )  # fmt: skip
+    return call, behind, tile
 
 
-def _render(camera: _Camera, rows: _Rows, background: Tensor | None, options: _Options) -> _Drawn:
-    gaussians, features, depth = _shapes(rows, options), [], None
-    cuts = camera.model != "pinhole" or camera.far < _ENDLESS  # the kernels know the near plane of a pinhole alone
-    with_depth = options.mode.endswith("D")
-    if cuts or with_depth:
-        depth = rows.means @ camera.view[2, :3] + camera.view[2, 3]
-    if options.mode.startswith("RGB") and options.degree is None:
-        features.append(rows.colors)
-    if with_depth:
-        features.append(depth[:, None])
-    behind = rows.means.new_zeros(1)  # also of depth
-    if background is not None and options.mode.startswith("RGB"):
-        behind = torch.nn.functional.pad(background, (0, 1)) if with_depth else background
-    opacities = rows.opacities
-    if cuts:
-        opacities = torch.where((depth > camera.near) & (depth < camera.far), opacities, 0)
-    wanted = any(values is not None and values.requires_grad for values in (*rows, camera.view, background))
-    probe = torch.empty_like(rows.means).requires_grad_(wanted and torch.is_grad_enabled())
-    settings = camera.settings(options.degree, options.antialiased, options.dilation, behind)
-    out = rasterize_channels(
-        rows.means,
-        probe,
-        opacities,
-        settings,
-        features=(features[0] if len(features) == 1 else torch.cat(features, 1)) if features else None,
-        depths=depth.detach() if cuts else None,
-        any_rotation=True,
-        want_absolute_gradient=options.absgrad,
-        most_alpha=_MOST_ALPHA,
-        **gaussians,
-    )
-    depths = depth.detach() if cuts else out.depths
-    found = _Described(*OPERATORS.describe(out.splats, depths, out.tile_counts), out.tile_counts)
-    if options.clip > 0:
-        small = (found.radii > 0).all(1) & (found.radii <= options.clip).all(1)
-        if small.any():
-            rest = rows._replace(opacities=torch.where(small, 0, rows.opacities))
-            return _render(camera, rest, background, options._replace(clip=0.0))
-    image, alpha = out.image.permute(1, 2, 0), (1 - out.transmittance).view(camera.height, camera.width, 1)
-    if options.mode.endswith("ED"):
-        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], -1)
-    return _Drawn(image, alpha, found, probe)
+def _check_renderer(config: Any) -> None:
+    """gsplat's classes, by their names: only its default is one for images without rays."""
+    name = type(config).__name__
+    if config is None or name == "RendererConfig_MixedBatch":
+        return
+    if all(base.__name__ != "RendererConfig" for base in type(config).__mro__):
+        raise TypeError(f"renderer_config must be a RendererConfig or None, got {name}")
+    if name != "RendererConfig_ParallelBatch":
+        raise NotImplementedError(f"there is no renderer of {name}")
+    raise ValueError(f"renderer_config {name} needs with_eval3d=True, which is not supported; {_NO_RAYS}")
 
 
-def _shapes(rows: _Rows, options: _Options) -> dict[str, Tensor]:
-    """Shapes and SH, by the names of `Gaussians`."""
-    if rows.covars is None:
-        shape = {"scales": rows.scales, "rotations": rows.quats}
+def _items(call: _Call, given: _Item, form: tuple[int, ...]) -> list[_Item]:
+    """The images. ValueError for tensors of wrong shapes or dtypes."""
+    if not all(form):
+        raise ValueError(f"there must be an image to render, got batches and cameras {form}")
+    if given.covars is not None:
+        given = given._replace(quats=None, scales=None)
+    given = given._replace(colors=given.colors if call.colored else None, K=given.K.detach().to(given.means.device))
+    _check_shapes(call, given, form)
+    if given.covars is not None:
+        upper = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
+        given = given._replace(covars=torch.stack([given.covars[..., i, j] for i, j in upper], -1))
+    *batch, cameras = form
+    axes = 2, 2, 2, 2, 1, 2 + (call.degree is not None), 2 + (call.signal_degree is not None), 2, 2, 1
+    images = []
+    for place in range(math.prod(batch)):
+        own = [_part(values, len(batch), n, place) for values, n in zip(given, axes, strict=True)]
+        for camera in range(cameras):
+            of_camera = (v if v is None or v.dim() == n else v[camera] for v, n in zip(own, axes, strict=True))
+            images.append(_Item(*of_camera))
+    return images
+
+
+def _part(values: Tensor | None, batch: int, axes: int, place: int) -> Tensor | None:
+    """What a batch has of values with so many leading axes; all, where they are not of batches."""
+    if values is None or not batch or values.dim() == axes:
+        return values
+    return values.flatten(0, batch - 1)[place]
+
+
+def _check_shapes(call: _Call, given: _Item, form: tuple[int, ...]) -> None:
+    batch, means = (form[:-1],), given.means
+    count, each, both = means.shape[-2], (form,), (form[:-1], form)
+    shapes = [("means", means, batch, (count, 3)), ("opacities", given.opacities, batch, (count,))]
+    shapes += [("viewmats", given.view, each, (4, 4)), ("Ks", given.K, each, (3, 3))]
+    if given.covars is None:
+        shapes += [("quats", given.quats, batch, (count, 4)), ("scales", given.scales, batch, (count, 3))]
     else:
-        places = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
-        shape = {"cov3d": torch.stack([rows.covars[:, i, j] for i, j in places], 1)}
-    if options.mode.startswith("RGB") and options.degree is not None:
-        harmonics = rows.colors if rows.colors.shape[1] <= MOST_BANDS else rows.colors[:, :MOST_BANDS]
-        shape["sh_dc"], shape["sh_rest"] = harmonics.split((1, harmonics.shape[1] - 1), 1)
-    return shape
+        shapes.append(("covars", given.covars, batch, (count, 3, 3)))
+    for name, values, degree in (
+        ("colors", given.colors, call.degree),
+        ("extra_signals", given.signals, call.signal_degree),
+    ):
+        if values is None and (name == "extra_signals" or not call.colored):
+            continue
+        if values is None or values.dim() < 2:
+            raise ValueError(f"{name} must be (..., N, D), got {None if values is None else tuple(values.shape)}")
+        harmonic = degree is not None
+        shapes.append((name, values, ((), *both) if harmonic else both, (count, *values.shape[-1 - harmonic :])))
+        if harmonic and values.shape[-2] < (degree + 1) ** 2:
+            raise ValueError(f"{name} of degree {degree} must have {(degree + 1) ** 2} bands, got {values.shape[-2]}")
+    if given.background is not None:
+        shapes.append(("backgrounds", given.background, each, given.background.shape[-1:]))
+    for name, values, leads, tail in shapes:
+        if values is None or all(values.shape != (*lead, *tail) for lead in leads):
+            raise ValueError(
+                f"{name} must be {(*leads[0], *tail)}, got {None if values is None else tuple(values.shape)}"
+            )
+        if values.dtype != means.dtype and name not in ("Ks", "backgrounds"):
+            raise ValueError(f"{name} must be {means.dtype} like means, got {values.dtype}")
+
+
+def _project(call: _Call, item: _Item) -> _Projection:
+    view, near = item.view, call.near
+    if call.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
+        view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
+    camera = OPERATORS.pinhole(view.detach(), item.K, *call.size)
+    lens = _lens(call, item.K)
+    opacities, depth = item.opacities, _depth(call, item)
+    if call.model != "pinhole" or call.far < _ENDLESS:  # the kernels know the near plane of a pinhole alone
+        z = item.means.detach() @ item.view.detach()[2, :3] + item.view.detach()[2, 3]
+        opacities = torch.where((z > call.near) & (z < call.far), opacities, 0)
+    colors, harmonics, degree, features = item.colors, (None, None), None, []
+    if colors is not None and call.degree is not None and call.degree <= MOST_DEGREE and colors.shape[-1] == 3:
+        bands = colors if colors.shape[1] <= MOST_BANDS else colors[:, :MOST_BANDS]
+        degree, harmonics = call.degree, bands.split((1, bands.shape[1] - 1), 1)
+    elif colors is not None:
+        features.append(_shown(item, colors, call.degree, 0.0))
+    if item.signals is not None:
+        features.append(_shown(item, item.signals, call.signal_degree, -math.inf))
+    scene = (
+        item.means, opacities, item.scales, item.quats, item.covars,
+        item.means.detach() if degree is None else None,  # projection asks for colours; nothing shows these
+        *harmonics, *camera, (*lens, call.eps2d, near), (*call.size, degree or 0, call.antialiased, 2),
+    )  # fmt: skip
+    numbers = _numbers(view, bool(degree), len(lens) > 3) if needs_function(view) else None
+    shared = Shared()
+    splats, own, rects, counts, _ = projected(shared, numbers, None, *scene)
+    if call.clip > 0:
+        radii = OPERATORS.describe(splats.detach(), own.detach(), counts)[0]
+        opacities = torch.where((radii <= call.clip).all(1), 0, opacities)
+        splats, own, rects, counts, _ = projected(shared, numbers, None, item.means, opacities, *scene[2:])
+    depth = own if depth is None else depth
+    *notes, rows = described(shared, call.packed, splats, depth, counts)
+    shown = torch.cat(features, 1) if len(features) > 1 else features[0] if features else None
+    return _Projection(shared, splats, degree is not None, shown, depth.detach(), rects, counts, tuple(notes), rows)
+
+
+def _lens(call: _Call, K: Tensor) -> tuple[float, ...]:
+    """The first numbers of Scene.lens. Of a pinhole no number goes to the host, which would wait for it."""
+    if call.model == "pinhole":
+        return 0.0, 0.0, 1.0
+    fx, _, cx, _, fy, cy, *_ = K.flatten().tolist()
+    height, width = call.size
+    fisheye = call.model == "fisheye"
+    lens = (_Fisheye if fisheye else Lens)("equidistant" if fisheye else "perspective", (fx, fy), (cx - 0.5, cy - 0.5))
+    return 0.0, 0.0, 1.0, *lens.numbers(width, height)
+
+
+def _numbers(view: Tensor, centered: bool, lens: bool) -> Tensor:
+    """The camera's numbers (camera.py), of which only the gradients of the pose are read: 15, then zeros."""
+    view = view.double()
+    center = torch.linalg.inv_ex(view)[0][:3, 3] if centered else view.new_zeros(3)
+    return torch.cat([view[:3, :3].reshape(9), view[:3, 3], center, view.new_zeros(_NUMBERS[lens])])
+
+
+def _depth(call: _Call, item: _Item) -> Tensor | None:
+    """Depths (N,) where they are not those that the kernels find."""
+    if not call.by_z:
+        return torch.linalg.vector_norm(item.means @ item.view[:3, :3].T + item.view[:3, 3], dim=1)
+    return None if call.model == "pinhole" else item.means @ item.view[2, :3] + item.view[2, 3]
+
+
+def _shown(item: _Item, values: Tensor, degree: int | None, least: float) -> Tensor:
+    """Values (N, D), or what SH (N, K, D) are in the directions from the camera, at least `least`."""
+    if degree is None:
+        return values
+    center = torch.linalg.inv_ex(item.view.double())[0][:3, 3].to(item.means)
+    return (sh_values(degree, values, item.means - center) + 0.5).clamp_min(least)
+
+
+@cache
+def _black(device: torch.device, dtype: torch.dtype) -> Tensor:
+    with torch.inference_mode(False):  # so that training can use it after a render in inference mode
+        return torch.zeros(1, device=device, dtype=dtype)
+
+
+def _joined(
+    call: _Call, notes: Sequence[tuple[Tensor, ...]], form: tuple[int, ...]
+) -> tuple[list[Tensor], list[tuple[Tensor, ...]]]:
+    """The notes of all images, and of each image what these are made of, so that images are made of the notes."""
+    if len(notes) == len(form) == 1:
+        return list(notes[0]), [notes[0]]
+    whole = [torch.cat(part) for part in zip(*notes, strict=True)]
+    if not call.packed:
+        whole = [part.unflatten(0, form) for part in whole]
+    sizes = [len(one[0]) for one in notes]
+    flat = whole if call.packed else [part.flatten(0, len(form) - 1) for part in whole]
+    return whole, list(zip(*(part.split(sizes) for part in flat), strict=True))
+
+
+def _blend(
+    call: _Call, item: _Item, of: _Projection, notes: tuple[Tensor, ...]
+) -> tuple[Tensor, Tensor, Tensor | None, list[Tensor]]:
+    """Image (1, H, W, D), alpha (1, H, W, 1), signals (1, H, W, E), and the lists of tiles."""
+    width = 0 if item.colors is None else item.colors.shape[-1]
+    signals = 0 if item.signals is None else item.signals.shape[-1]
+    further, behind = signals + call.deep, item.background if call.colored else None
+    if call.absgrad and width + further > MOST_CHANNELS:
+        raise ValueError(f"absgrad needs at most {MOST_CHANNELS} channels, got {width + further}")
+    if behind is None:
+        behind = _black(item.means.device, item.means.dtype)
+    else:
+        behind = behind.to(item.means)
+        behind = torch.nn.functional.pad(behind, (0, further)) if further else behind
+    _, means2d, depths, conics, opacities, _ = notes
+    image, alpha, *lists = blended(
+        of.shared,
+        Blending(call.size, _MOST_ALPHA, True, of.colored, call.absgrad, True),
+        of.splats.requires_grad or needs_function(of.features, behind),
+        *(of.order, of.rects, of.tile_counts, of.rows, of.splats),
+        *(means2d, conics, opacities, depths if call.deep else None, of.features, behind),
+    )
+    if call.mean_depth:
+        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], -1)
+    if not signals:
+        return image, alpha, None, lists
+    end = width + signals  # behind the signals are the depths
+    return torch.cat([image[..., :width], image[..., end:]], -1), alpha, image[..., width:end], lists
 
 
 def _meta(
-    drawn: Sequence[_Drawn], form: tuple[int, ...], size: tuple[int, int], tile: int, packed: bool, absgrad: bool
-) -> dict[str, Any]:
-    """The notes, in which means2d gets `grad`, and `absgrad`, when the gradients of its parts are known."""
-    ids = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
-    rows = None
-    if packed:
-        rows = [(one.found.radii > 0).all(1).nonzero()[:, 0] for one in drawn]
-        image = torch.cat([torch.full_like(own, n) for n, own in enumerate(rows)])
-        ids = {"batch_ids": image // form[-1], "camera_ids": image % form[-1], "gaussian_ids": torch.cat(rows)}
-        parts = zip(*([part[own] for part in one.found] for one, own in zip(drawn, rows, strict=True)), strict=True)
-        values = _Described(*(part[0] if len(part) == 1 else torch.cat(part) for part in parts))
-    else:
-        values = _Described(*(_together(part, form) for part in zip(*(d.found for d in drawn), strict=True)))
-    means2d = values.means2d.requires_grad_(drawn[0].probe.requires_grad)
+    call: _Call,
+    notes: list[Tensor],
+    lists: Sequence[tuple[Tensor, ...]],
+    projections: Sequence[_Projection],
+    form: tuple[int, ...],
+    tile: int,
+) -> Meta:
+    """The notes as gsplat names them; means2d gets `absgrad` in a backward."""
+    rows = [one.rows for one in projections]
+    ids: dict[str, Any] = dict.fromkeys(("batch_ids", "camera_ids", "gaussian_ids"))
+    if call.packed:
+        if form == (1,):
+            ids = dict.fromkeys(ids, torch.zeros_like(rows[0])) | {"gaussian_ids": rows[0]}
+        else:
+            image = torch.cat([torch.full_like(own, n) for n, own in enumerate(rows)])
+            ids = {"batch_ids": image // form[-1], "camera_ids": image % form[-1], "gaussian_ids": torch.cat(rows)}
     begin = 0
-    for n, one in enumerate(drawn) if means2d.requires_grad else ():
-        place = n if rows is None else slice(begin, begin := begin + len(rows[n]))
-        one.probe.register_hook(_collector(means2d, place, rows and rows[n], absgrad, size))
-    notes = {"radii": values.radii, "means2d": means2d, "depths": values.depths, "conics": values.conics}
-    notes |= {"opacities": values.opacities, "tiles_per_gauss": values.tiles}
-    (width, height), across, down = size, *(-(-pixels // tile) for pixels in size)
-    sizes = {"width": width, "height": height, "tile_size": tile, "tile_width": across, "tile_height": down}
-    return ids | notes | sizes | {"n_batches": math.prod(form[:-1]), "n_cameras": form[-1]}
+    for n, one in enumerate(projections) if call.absgrad else ():
+        place = slice(begin, begin := begin + len(one.rows)) if call.packed else n
+        one.shared.use_lengths = _Lengths(TensorWeakRef(notes[1]), place, one.rows, call.size[1])
+    names = "radii", "means2d", "depths", "conics", "opacities", "tiles_per_gauss"
+    (height, width), tiles = call.size, [-(-pixels // tile) for pixels in call.size]
+    sizes = {"width": width, "height": height, "tile_size": tile, "tile_width": tiles[1], "tile_height": tiles[0]}
+    sizes |= {"n_batches": math.prod(form[:-1]), "n_cameras": form[-1]}
+    return Meta(ids | dict(zip(names, notes, strict=True)) | sizes, form, lists, rows)
 
 
-def _collector(
-    means2d: Tensor, place: int | slice, rows: Tensor | None, absgrad: bool, size: tuple[int, int]
-) -> Callable[[Tensor], None]:
-    """What puts the gradients of an image's means, which are per NDC unit, into `means2d`; of packed ones, its rows."""
+class _Lengths(NamedTuple):
+    """Puts the lengths of an image's absolute gradients, per NDC unit, into `absgrad` of means2d."""
 
-    def collect(gradient: Tensor) -> None:
-        if rows is not None:
-            gradient = gradient[rows]
-        for name, first in (("grad", 0), ("absgrad", 2))[: 1 + absgrad]:
-            if getattr(means2d, name, None) is None:
-                setattr(means2d, name, torch.zeros_like(means2d))
-            into = getattr(means2d, name)
-            own = into[place] if rows is not None else into.flatten(0, -3)[place]
-            for axis in range(2 if first == 0 else 1):
-                own[:, axis].add_(gradient[:, first + axis], alpha=2 / size[axis])
+    means2d: TensorWeakRef
+    place: int | slice
+    rows: Tensor | None
+    width: int
 
-    return collect
+    def __call__(self, lengths: Tensor) -> None:
+        if (means2d := self.means2d()) is None:
+            return
+        if getattr(means2d, "absgrad", None) is None:
+            means2d.absgrad = torch.zeros_like(means2d)
+        into = means2d.absgrad.flatten(0, -3)[self.place] if self.rows is None else means2d.absgrad[self.place]
+        into[:, 0] = (lengths if self.rows is None else lengths[self.rows]) * (2 / self.width)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,9 @@ def install() -> None:
     try:
         import gsplat
         import gsplat.rendering as rendering
-    except ImportError:
+    except ModuleNotFoundError as error:
+        if error.name not in ("gsplat", "gsplat.rendering"):
+            raise  # gsplat is there, and lacks something
         gsplat, rendering = ModuleType("gsplat"), ModuleType("gsplat.rendering")
         gsplat.rendering = rendering
         sys.modules.update({"gsplat": gsplat, "gsplat.rendering": rendering})
@@ -37,15 +39,18 @@ def with_one_radius(*inputs: Any, **options: Any) -> tuple[Tensor, Tensor, dict[
     return image, alpha, meta | {"radii": meta["radii"].amax(-1)}
 
 
-def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+def relocated(
+    opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor, min_opacity: float = 0.005
+) -> tuple[Tensor, Tensor]:
     """Opacities (N,) and scales (N, 3) of each of the equal parts that Gaussians are replaced by.
 
-    ratios (N,): how many parts. binoms (n, n): binomial coefficients, of which the number limits the parts. The parts'
-    rule is equation 9 of Kheradmand et al. 2024; its inner sums of binomials are added up to those of one row more.
+    ratios (N,): how many parts. binoms (n, n): binomial coefficients, of which the number limits the parts.
+    min_opacity: of a part, with which its scales are found. The parts' rule is equation 9 of Kheradmand et al. 2024;
+    its inner sums of binomials are added up to those of one row more.
     """
     most = len(binoms)
     count = ratios.clamp(1, most).long()
-    parts = 1 - (1 - opacities.double()) ** (1 / count.double())
+    parts = (1 - (1 - opacities.double()) ** (1 / count.double())).clamp(min_opacity, 1 - 2.0**-23)
     k = torch.arange(1, most + 1, device=opacities.device).double()
     above, below = count[:, None].double(), count[:, None] - k
     choose = (torch.lgamma(above + 1) - torch.lgamma(k + 1) - torch.lgamma(below.clamp_min(0) + 1)).exp().round()

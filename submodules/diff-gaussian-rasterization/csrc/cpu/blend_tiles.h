@@ -185,8 +185,15 @@ void blend_tile(const BlendInput<T>& in, int64_t index, const Blended<T>& out) {
   for (int64_t c = 0; c < in.planes(); ++c) {
     T* plane = c < kLeading ? state.payload[c] : further.plane(c);
     for (int p = 0; p < kPixels; ++p) plane[p] += state.transmittance[p] * in.background[c];
-    write_tile(plane, in.image, tile, out.color + c * in.image.width * in.image.height);
+    if (kPayload == kChannels)
+      each_pixel(in.image, tile, [&](int from, int64_t to) {
+        out.color[c * in.channels.plane + in.channels.pixel * to] = plane[from];
+      });
+    else
+      write_tile(plane, in.image, tile, out.color + c * in.image.width * in.image.height);
   }
+  if (kPayload == kChannels && out.alpha)
+    each_pixel(in.image, tile, [&](int from, int64_t to) { out.alpha[to] = 1 - state.transmittance[from]; });
   write_tile(state.transmittance, in.image, tile, out.transmittance);
   if (kPayload == kColorAndDepth) write_tile(state.payload[3], in.image, tile, out.inverse_depth);
   if (kLast) write_tile(state.last, in.image, tile, out.last);

@@ -236,7 +236,11 @@ void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& 
   if (g.transmittance_gradient) read_tile(g.transmittance_gradient, in.image, tile, state.behind);
   for (int64_t c = 0; c < in.planes(); ++c) {
     T* pixels = c < kLeading ? state.payload[c] : further.plane(c);
-    read_tile(g.color + c * plane, in.image, tile, pixels);
+    if (kPayload == kChannels)
+      each_pixel(in.image, tile,
+                 [&](int to, int64_t from) { pixels[to] = g.color[c * in.channels.plane + in.channels.pixel * from]; });
+    else
+      read_tile(g.color + c * plane, in.image, tile, pixels);
     for (int p = 0; p < kPixels; ++p) state.behind[p] += in.background[c] * pixels[p];
     interleave<T>(pixels);
   }
@@ -296,11 +300,11 @@ std::vector<int32_t> mark_rows(const Executor& executor, const BlendInput<T>& in
   return processed;
 }
 
-// The passes over channels. values: their gradient, (N, channels), or null.
+// The passes over channels.
 template <class T, int kRays, bool kAbsolute>
 void fill_passes(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
-                 const std::vector<int32_t>& processed, const GradientRows<T, kSums<kRays, kAbsolute>>& rows,
-                 T* values) {
+                 const std::vector<int32_t>& processed, const GradientRows<T, kSums<kRays, kAbsolute>>& rows) {
+  T* const values = g.values_apart(in.channels) ? g.values : nullptr;
   const auto first_row = [&](int64_t splat) { return rows.number(g.slots[splat].first); };
   const std::unique_ptr<T[]> channels(values ? new T[kMostChannels * first_row(g.count)] : nullptr);
   each_pass(in, [&](int64_t first, const BlendInput<T>& pass, int64_t plane) {
@@ -324,13 +328,12 @@ void fill_passes(const Executor& executor, const BlendInput<T>& in, const BlendG
 
 template <class T, int kRays, bool kAbsolute, class Memory>
 GradientRows<T, kSums<kRays, kAbsolute>> fill_rows(const Executor& executor, const BlendInput<T>& in,
-                                                   const BlendGradient<T>& g, const Memory& memory,
-                                                   T* values = nullptr) {
+                                                   const BlendGradient<T>& g, const Memory& memory) {
   GradientRows<T, kSums<kRays, kAbsolute>> rows(g.slot_count);
   const std::vector<int32_t> processed = mark_rows(executor, in, g, rows);
   rows.allocate(memory);
   if constexpr (kRays != kLensRays)
-    if (in.channels.count) return fill_passes<T, kRays, kAbsolute>(executor, in, g, processed, rows, values), rows;
+    if (in.channels.count) return fill_passes<T, kRays, kAbsolute>(executor, in, g, processed, rows), rows;
   const auto run = g.inverse_depth ? blend_tile_vjp<T, kRays, kColorAndDepth, kAbsolute>
                                    : blend_tile_vjp<T, kRays, kColor, kAbsolute>;
   for_dynamic(executor, tiles_of(in.image), 1,
@@ -371,13 +374,17 @@ void sum_gradients(const Executor& executor, const BlendInput<T>& in, const Blen
   });
   sum_splats<T, kRays, kAbsolute>(executor, g.count, [&](int64_t i) { return rows.row(g.slots[i].first); },
                                   {in.splats, in.image, g.moments, g.absolute});
+  if (!g.values || g.values_apart(in.channels)) return;
+  for (int64_t i = 0; i < g.count; ++i)
+    std::copy_n(g.moments + kGradientRow<kRays> * i + kColorMoment, in.channels.count,
+                g.values + in.channels.count * i);
 }
 
 template <class T, int kRays, bool kAbsolute>
 void keep_rows(const Executor& executor, const BlendInput<T>& in, const BlendGradient<T>& g,
                const RowMemory<T>& memory) {
   const auto take = [&](int64_t count) { return memory.take(memory.context, count); };
-  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g, take, memory.values);
+  const auto rows = fill_rows<T, kRays, kAbsolute>(executor, in, g, take);
   for_dynamic(executor, g.count, 1024, [&](int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i)
       memory.counts[i] =

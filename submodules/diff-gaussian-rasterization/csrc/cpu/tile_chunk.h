@@ -36,6 +36,13 @@ void write_tile(const From* pixels, Image image, const Tile& tile, To* plane) {
     std::copy_n(pixels + r * kTile, tile.columns, plane + int64_t(tile.y + r) * image.width + tile.x);
 }
 
+// Calls visit(pixel of the tile, pixel of the image).
+template <class Visit>
+void each_pixel(Image image, const Tile& tile, const Visit& visit) {
+  for (int r = 0; r < tile.rows; ++r)
+    for (int c = 0; c < tile.columns; ++c) visit(r * kTile + c, int64_t(tile.y + r) * image.width + tile.x + c);
+}
+
 // Has the splats of instances fetched into the cache, for a chunk that is gathered later: they lie anywhere.
 template <class T>
 void prefetch_splats(const BlendInput<T>& in, int64_t begin, int64_t end) {

@@ -276,11 +276,11 @@ __global__ void GS_MAX_REGISTERS((kRegisters<kRays, P, kAbsolute>))
 template <int kWidth>
 __global__ void __launch_bounds__(256)
     sum_channels_kernel(const int32_t* halted, int64_t count, RowPlaces places, const float* rows,
-                        const SplatSlots* slots, Channels<float> pass, float* to) {
+                        const SplatSlots* slots, int64_t channels, int64_t columns, float* to) {
   if (!begin_work(halted)) return;
   const int64_t splat = (int64_t(blockIdx.x) * 256 + threadIdx.x) / kWidth;
   const int channel = threadIdx.x % kWidth;
-  if (splat >= count || channel >= pass.count) return;
+  if (splat >= count || channel >= channels) return;
   const int64_t begin = places.row(slots[splat].first), end = places.row(slots[splat + 1].first);
   constexpr int kTogether = 4;  // rows whose loads do not wait for each other, and whose sums grow apart
   float sums[kTogether] = {};
@@ -288,7 +288,7 @@ __global__ void __launch_bounds__(256)
 #pragma unroll
     for (int i = 0; i < kTogether; ++i)
       if (row + i < end) sums[i] += rows[kWidth * (row + i) + channel];
-  to[splat * pass.stride + channel] = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+  to[splat * columns + channel] = (sums[0] + sums[1]) + (sums[2] + sums[3]);
 }
 
 // What the rows are made from.
@@ -319,10 +319,11 @@ void fill_rows_of(const Queue& queue, const Source& from, bool absolute, const O
          chunk_size, layers, layers_at(g.layers, in.instance_count), out);
 }
 
-// The passes over channels. values: of RowMemory.
+// The passes over channels.
 template <int kRays>
-void fill_passes(const Queue& queue, const Source& from, bool absolute, OutRows<kRays> out, float* values) {
+void fill_passes(const Queue& queue, const Source& from, bool absolute, OutRows<kRays> out) {
   const BlendGradient<float>& g = from.gradient;
+  float* const values = g.values_apart(from.in.channels) ? g.values : nullptr;
   const int64_t widest = from.in.channels.count > 16 ? kMostChannels : 16;
   out.channels = values ? queue.array<float>(size_t(from.found.rows) * widest) : nullptr;
   each_pass(from.in, [&](int64_t first, const BlendInput<float>& pass, int64_t plane) {
@@ -335,16 +336,17 @@ void fill_passes(const Queue& queue, const Source& from, bool absolute, OutRows<
       fill_rows_of<P>(queue, {pass, gradient, from.found, from.chunk_size, from.layers, false}, absolute, out);
       if (values && g.count)
         launch(queue, "sum_channels", sum_channels_kernel<P::kWidth>, blocks_for(g.count * P::kWidth, 256), 256,
-               g.count, from.found.places, out.channels, g.slots, pass.channels, values + first);
+               g.count, from.found.places, out.channels, g.slots, pass.channels.count, from.in.channels.count,
+               values + first);
     });
   });
 }
 
 // Runs the backward up to the rows. take: allocates those of the gradients, for their number, for which the host waits
-// if `exact`, else perhaps for more. values: of RowMemory.
+// if `exact`, else perhaps for more.
 template <int kRays, class Take>
 FilledRows<kRays> blend_back(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g,
-                             bool absolute, bool exact, float* values, const Take& take) {
+                             bool absolute, bool exact, const Take& take) {
   const int chunk_size = tiles_of(in.image) <= kFewTiles ? kChunkOfFew : kChunkOfMany;
   const Processed found = find_processed(queue, in, g, chunk_size, exact);
   const GradientRows<kRays> gradients{found.places, take(found.rows)};
@@ -354,7 +356,7 @@ FilledRows<kRays> blend_back(const Queue& queue, const BlendInput<float>& in, co
   const Source from{in, g, found, chunk_size, layers, made};
   const OutRows<kRays> out{gradients, lengths.values, nullptr, false};
   if (in.channels.count) {
-    if constexpr (kRays != kLensRays) fill_passes<kRays>(queue, from, absolute, out, values);
+    if constexpr (kRays != kLensRays) fill_passes<kRays>(queue, from, absolute, out);
   } else {
     (g.inverse_depth ? fill_rows_of<Colors<true>, kRays> : fill_rows_of<Colors<false>, kRays>)(queue, from, absolute,
                                                                                                out);
@@ -368,8 +370,7 @@ void keep_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradi
                const RowMemory<float>& memory) {
   float* rows = nullptr;
   int64_t count = 0;
-  const bool exact = !in.channels.count;
-  const auto filled = blend_back<kRays>(queue, in, g, memory.absolute, exact, memory.values, [&](int64_t room) {
+  const auto filled = blend_back<kRays>(queue, in, g, memory.absolute, true, [&](int64_t room) {
     count = room, rows = memory.take(memory.context, room);
     return memory.absolute ? queue.array<float>(size_t(room) * kGradientRow<kRays>) : rows;
   });
@@ -381,9 +382,9 @@ void keep_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradi
 
 template <int kRays>
 GradientRows<kRays> fill_rows(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
-  const FilledRows<kRays> rows =
-      blend_back<kRays>(queue, in, g, g.absolute != nullptr, false, nullptr,
-                        [&](int64_t count) { return queue.array<float>(size_t(count) * kGradientRow<kRays>); });
+  const FilledRows<kRays> rows = blend_back<kRays>(queue, in, g, g.absolute != nullptr, false, [&](int64_t count) {
+    return queue.array<float>(size_t(count) * kGradientRow<kRays>);
+  });
   if (g.absolute) find_lengths(queue, g.count, {rows.absolute, g.slots}, in.splats, kRays, in.image, g.absolute);
   queue.release(queue.context, rows.absolute.values);  // the gradients come next, and take most of a step's memory
   return rows.gradients;

@@ -68,12 +68,15 @@ struct Picture {
     for (int p = 0; p < kRun; ++p) {
       const int x = left + at.x + at.column(p), y = top + at.y;
       if (x >= in.image.width || y >= in.image.height) continue;
-      const int64_t pixel = int64_t(y) * in.image.width + x, plane = int64_t(in.image.width) * in.image.height;
+      const int64_t pixel = int64_t(y) * in.image.width + x;
+      const int64_t plane = P::kChannels ? in.channels.plane : int64_t(in.image.width) * in.image.height;
+      float* const color = out.color + (P::kChannels ? in.channels.pixel : 1) * pixel;
 #pragma unroll
       for (int c = 0; c < P::kPlanes; ++c)
         if (!P::kChannels || c < in.channels.count)
-          out.color[c * plane + pixel] = payload[p][c] + transmittance[p] * in.background[c];
+          color[c * plane] = payload[p][c] + transmittance[p] * in.background[c];
       out.transmittance[pixel] = transmittance[p];
+      if (P::kChannels && out.alpha) out.alpha[pixel] = 1 - transmittance[p];
       if (P::kDepth) out.inverse_depth[pixel] = payload[p][kWidth - 1];
       if (kLast) out.last[pixel] = last[p];
     }

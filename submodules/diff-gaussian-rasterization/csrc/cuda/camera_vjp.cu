@@ -47,9 +47,9 @@ __device__ void sum_numbers(const float (&g)[kNumbers], int first, double* row) 
 }
 
 // sums (blocks, numbers): those of blocks that sleep are not written.
-template <class AnyCamera>
+template <class AnyCamera, class Source>
 __global__ void __launch_bounds__(kThreads)
-    camera_vjp_kernel(const int32_t* halted, Scene<float> s, SlotSums<false> source, double* sums) {
+    camera_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, double* sums) {
   if (!begin_work(halted)) return;
   const int64_t block = awake_block(s, blockIdx.x);
   if (block < 0) return;
@@ -93,12 +93,13 @@ __global__ void __launch_bounds__(kThreads)
   out[blockIdx.x] = all;
 }
 
-void sum_rows(const Queue& queue, const Scene<float>& s, const SlotSums<false>& source, double* sums) {
+template <class Source>
+void sum_rows(const Queue& queue, const Scene<float>& s, const Source& source, double* sums) {
   const size_t values = size_t(camera_numbers(s)) * sleep_blocks(s.count);
   if (s.blocks || s.awake) GS_CUDA_CHECK(cudaMemsetAsync(sums, 0, values * sizeof *sums, stream_of(queue)));
   if (!s.rows()) return;
-  const auto kernel =
-      s.lens.chart == Chart::kPinhole ? camera_vjp_kernel<Camera<float>> : camera_vjp_kernel<LensCamera<float>>;
+  const auto kernel = s.lens.chart == Chart::kPinhole ? camera_vjp_kernel<Camera<float>, Source>
+                                                      : camera_vjp_kernel<LensCamera<float>, Source>;
   launch(queue, "camera_vjp", kernel, blocks_for(s.rows(), kThreads), kThreads, s, source, sums);
 }
 
@@ -117,6 +118,11 @@ void camera_vjp(const Queue& queue, const Scene<float>& s, const SlotSums<false>
 
 void camera_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>& in, double* sums) {
   sum_rows(queue, s, sums_of<false>(queue, in, {}), sums);
+}
+
+void camera_vjp(const Queue& queue, const Scene<float>& s, const int32_t* tile_counts, const float* moments,
+                double* sums) {
+  sum_rows(queue, s, StoredMoments<false>{moments, tile_counts}, sums);
 }
 
 }  // namespace cuda

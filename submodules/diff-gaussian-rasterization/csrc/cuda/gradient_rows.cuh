@@ -121,6 +121,18 @@ struct SlotSumsOf {
 template <int kRays>
 using SlotSums = SlotSumsOf<baseline::kGradientRow<kRays>>;
 
+// Another source of moments: those that were summed before.
+template <int kRays>
+struct StoredMoments {
+  const float* moments;
+  const int32_t* tile_counts;
+  __device__ bool seen(int64_t i) const { return tile_counts[i] != 0; }
+  __device__ void read(int64_t i, bool wanted, float* m, float* /*stage*/) const {
+    constexpr int kRow = baseline::kGradientRow<kRays>;
+    for (int v = 0; wanted && v < kRow; ++v) m[v] = moments[kRow * i + v];
+  }
+};
+
 // Finds the lengths of absolute gradients (N), 0 where a splat was not seen.
 void find_lengths(const Queue& queue, int64_t count, const SlotSumsOf<baseline::kAbsoluteValues>& sums,
                   const float* splats, int rays, Image image, float* absolute);

@@ -69,7 +69,7 @@ struct Pixels {
 
   __device__ Pixels(const BlendInput<float>& in, const BlendGradient<float>& g, const L& at, int left, int top,
                     int first) {
-    const int64_t plane = int64_t(in.image.width) * in.image.height;
+    const int64_t plane = P::kChannels ? in.channels.plane : int64_t(in.image.width) * in.image.height;
     furthest = 0;
 #pragma unroll
     for (int p = 0; p < L::kRun; ++p) {
@@ -78,10 +78,11 @@ struct Pixels {
       const int64_t pixel = inside ? int64_t(y) * in.image.width + x : 0;
       transmittance[p] = inside ? g.transmittance[pixel] : 1;
       last[p] = inside ? g.last[pixel] - first : 0;
+      const float* const color = g.color + (P::kChannels ? in.channels.pixel : 1) * pixel;
 #pragma unroll
       for (int c = 0; c < P::kWidth; ++c) {
         const bool depth = P::kDepth && c == 3, exists = inside && (!P::kChannels || c < in.channels.count);
-        gradient[p][c] = !exists ? 0 : depth ? g.inverse_depth[pixel] : g.color[c * plane + pixel];
+        gradient[p][c] = !exists ? 0 : depth ? g.inverse_depth[pixel] : color[c * plane];
       }
       background[p] = in.background[0] * gradient[p][0];
 #pragma unroll

@@ -18,18 +18,6 @@ namespace {
 constexpr int kThreads = kSleepBlock;
 constexpr int kBlocks = 5;  // that an SM is to hold at once: more registers do not pay
 
-// A source of moments for project_vjp_kernel, as SlotSums is: moments that were summed before.
-template <int kRays>
-struct StoredMoments {
-  const float* moments;
-  const int32_t* tile_counts;
-  __device__ bool seen(int64_t i) const { return tile_counts[i] != 0; }
-  __device__ void read(int64_t i, bool wanted, float* m, float* /*stage*/) const {
-    constexpr int kRow = kGradientRow<kRays>;
-    for (int v = 0; wanted && v < kRow; ++v) m[v] = moments[kRow * i + v];
-  }
-};
-
 // A Gaussian's gradients, except those that go to memory or shared memory at once.
 struct RowGradient {
   float means[3], means2d[3], opacity, scales[3], rotation[4], sh_dc[3];

@@ -31,8 +31,8 @@ __global__ void __launch_bounds__(kThreads)
 }
 
 template <int kRays>
-__global__ void __launch_bounds__(kThreads)
-    moments_kernel(const int32_t* halted, int64_t count, SlotSums<kRays> sums, float* moments) {
+__global__ void __launch_bounds__(kThreads) moments_kernel(const int32_t* halted, int64_t count, SlotSums<kRays> sums,
+                                                           float* moments, int channels, float* of_channels) {
   if (!begin_work(halted)) return;
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   constexpr int kRow = kGradientRow<kRays>, kStage = SlotSums<kRays>::kStage;
@@ -41,6 +41,7 @@ __global__ void __launch_bounds__(kThreads)
   sums.read(i, i < count && sums.seen(i), values, stage + threadIdx.x / 32 * kStage);
   if (i >= count) return;
   for (int v = 0; v < kRow; ++v) moments[kRow * i + v] = values[v];
+  for (int c = 0; c < channels; ++c) of_channels[channels * i + c] = values[kColorMoment + c];
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -124,7 +125,9 @@ void lay_out(const Queue& queue, const SplatRows<float>& in, SplatSlots* slots, 
 template <int kRays>
 void sum_moments(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
   const SlotSums<kRays> sums{fill_rows<kRays>(queue, in, g), g.slots};
-  launch(queue, "moments", moments_kernel<kRays>, blocks_for(g.count, kThreads), kThreads, g.count, sums, g.moments);
+  const bool held = g.values && !g.values_apart(in.channels);
+  launch(queue, "moments", moments_kernel<kRays>, blocks_for(g.count, kThreads), kThreads, g.count, sums, g.moments,
+         held ? int(in.channels.count) : 0, g.values);
 }
 
 }  // namespace

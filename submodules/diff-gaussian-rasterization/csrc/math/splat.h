@@ -30,6 +30,7 @@ GS_HD V unrolled(const Splat<T>& s, V left, int width) {
 
 // Gradient sums of a splat over its pixels: moments of the exponent (footprint.h), then colour and inverse depth.
 constexpr int kGradientValues = 10;  // q, qu, qv, quu, quv, qvv, r, g, b, inverse depth
+constexpr int kColorMoment = 6;      // where r, g, b begin
 
 // A splat of which a pixel sees what is on its ray (ray.h).
 template <class T>

@@ -60,7 +60,7 @@ Tensor background_like(const Tensor& background, const Tensor& splats, int64_t c
 
 int64_t row_values(bool absolute, gs::Rays rays) { return gradient_row(rays) + (absolute ? kAbsoluteValues : 0); }
 
-BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t channels) : table_(table) {
+BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t channels, bool last) : table_(table) {
   GS_CHECK_VALUE(source.size() == kKept, "a backward takes ", int(kKept), " tensors that a forward has kept, got ",
                  source.size());
   std::copy(source.begin(), source.end(), kept_.begin());
@@ -70,7 +70,9 @@ BlendBackward::BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t cha
   for (Kept one : {kInstances, kRanges, kSplatSlots, kLast, kTransmittance}) kept_[one] = packed(kept_[one]);
   kept_[kSplats] = aligned(splats(), 2);
   kept_[kBackground] = background_like(kept_[kBackground], splats(), channels);
-  color_ = plane(grad_color, channels), alpha_ = plane(grad_transmittance, 1), depth_ = plane(grad_inverse_depth, 1);
+  const int64_t h = image_.height, w = image_.width;
+  color_ = plane(grad_color, last ? Shape{1, h, w, channels} : Shape{channels, h, w});
+  alpha_ = plane(grad_transmittance, {1, h, w}), depth_ = plane(grad_inverse_depth, {1, h, w});
   check_given(color_, "grad_color");
   check_layers();
   kept_[kLayers] = aligned(kept_[kLayers], 4);
@@ -101,23 +103,27 @@ void BlendBackward::check_layers() const {
                  layers.size(0));
 }
 
-Tensor BlendBackward::plane(const MaybeTensor& t, int64_t channels) const {
+Tensor BlendBackward::plane(const MaybeTensor& t, Sizes sizes) const {
   if (!t.has_value() || !t->defined()) return {};
-  check_precise(*t, "the gradient of an image", {channels, image_.height, image_.width});
+  check_precise(*t, "the gradient of an image", sizes);
   return converted(*t, splats());
 }
 
 GradientSource::GradientSource(const SceneTensors& scene, SOURCE_PARAMETERS, bool absolute, bool lengths)
     : image_(scene.image()) {
-  const bool rows = source.size() == 4 && !grad_color;
+  const bool rows = source.size() == 4 && !grad_color, moments = source.size() == 3 && !grad_color;
   GS_CHECK(!rows || scene.rays() != gs::kLensRays, "there are no gradient rows of Gaussians on the rays of a lens");
-  GS_CHECK_VALUE(rows || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
-                 " tensors, or splats, tile_counts, rows and counts, got ", source.size(), " tensors");
+  GS_CHECK_VALUE(rows || moments || source.size() == kKept, "the source must be what a forward has kept, ", int(kKept),
+                 " tensors, or splats, tile_counts, and rows and counts or moments, got ", source.size(), " tensors");
   check_tensor(source[kSplats], "splats", scene.dtype(), scene.device(), {scene.rows(), splat_row(scene.rays())});
-  if (!rows) blend_.emplace(SOURCE_ARGUMENTS, scene.table());
+  if (!rows && !moments) blend_.emplace(SOURCE_ARGUMENTS, scene.table());
   check_counts(source[kTileCounts], scene.rows(), scene.device());
   tile_counts_ = packed(source[kTileCounts]);
   if (rows) take_rows(scene, source, absolute, lengths);
+  if (!moments) return;
+  GS_CHECK_VALUE(!lengths, "moments have no absolute gradients");
+  check_tensor(source[2], "moments", scene.dtype(), scene.device(), {scene.rows(), row_values(false, scene.rays())});
+  moments_ = packed(source[2]);
 }
 
 void GradientSource::take_rows(const SceneTensors& scene, List<Tensor> source, bool absolute, bool lengths) {
@@ -142,6 +148,7 @@ void GradientSource::check_sum() const {
 }
 
 Tensor GradientSource::moments(const Tensor& lengths) const {
+  if (moments_.defined()) return moments_;
   const Tensor& like = blend_ ? blend_->splats() : splats_;
   Tensor moments = empty({like.size(0), row_values(false, rays_of(like))}, like);
   with_scalar(like.scalar_type(), [&](auto zero) {
@@ -158,7 +165,10 @@ Tensor GradientSource::moments(const Tensor& lengths) const {
 #ifdef GS_CUDA
 void GradientSource::vjp(const gs::Queue& queue, const gs::Scene<float>& scene, const Tensor& lengths,
                          const gs::cuda::GradientMemory& memory) const {
-  if (blend_)
+  if (moments_.defined())
+    gs::cuda::project_vjp(queue, scene, read<int32_t>(tile_counts_), read<float>(moments_),
+                          memory.take(memory.context));
+  else if (blend_)
     gs::cuda::rasterize_vjp(queue, scene, blend_->input<float>(), blend_->gradient<float>(nullptr, lengths), memory);
   else
     gs::cuda::rows_vjp(queue, scene, input<float>(), sums<float>(nullptr, lengths), memory);
@@ -166,6 +176,7 @@ void GradientSource::vjp(const gs::Queue& queue, const gs::Scene<float>& scene, 
 
 void GradientSource::step(const gs::Queue& queue, const gs::Scene<float>& scene, const Tensor& lengths,
                           const gs::GaussianStep<float>& step) const {
+  GS_CHECK(!moments_.defined(), "a step is taken from gradient rows, or from what a forward has kept");
   if (blend_)
     gs::cuda::rasterize_vjp_step(queue, scene, blend_->input<float>(), blend_->gradient<float>(nullptr, lengths), step);
   else
@@ -173,7 +184,10 @@ void GradientSource::step(const gs::Queue& queue, const gs::Scene<float>& scene,
 }
 
 void GradientSource::camera(const gs::Queue& queue, const gs::Scene<float>& scene, double* out) const {
-  gs::cuda::camera_vjp(queue, scene, input<float>(), out);
+  if (moments_.defined())
+    gs::cuda::camera_vjp(queue, scene, read<int32_t>(tile_counts_), read<float>(moments_), out);
+  else
+    gs::cuda::camera_vjp(queue, scene, input<float>(), out);
 }
 #endif
 

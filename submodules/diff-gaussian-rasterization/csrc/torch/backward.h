@@ -61,15 +61,14 @@ class KeptRows {
   KeptRows(const Tensor& splats, bool absolute)
       : counts(empty<int32_t>({splats.size(0)}, splats)), splats_(splats), absolute_(absolute) {}
 
-  // values: gs::RowMemory::values.
   template <class T>
-  gs::RowMemory<T> memory(T* values = nullptr) {
+  gs::RowMemory<T> memory() {
     const auto take = [](void* context, int64_t count) {
       auto& to = *static_cast<KeptRows*>(context);
       to.rows = empty({count, row_values(to.absolute_, rays_of(to.splats_))}, to.splats_);
       return write<T>(to.rows);
     };
-    return {take, this, write<int32_t>(counts), absolute_, values};
+    return {take, this, write<int32_t>(counts), absolute_};
   }
 
  private:
@@ -78,10 +77,10 @@ class KeptRows {
 };
 
 // Owns the tensors that the gs::BlendInput and gs::BlendGradient of a backward point into. source: Kept. table: of
-// gs::BlendInput, or undefined. channels: of the image.
+// gs::BlendInput, or undefined. channels: of the image; last: whether they are its last axis.
 class BlendBackward {
  public:
-  BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t channels = 3);
+  BlendBackward(SOURCE_PARAMETERS, const Tensor& table, int64_t channels = 3, bool last = false);
 
   const Tensor& splats() const { return kept_[kSplats]; }
 
@@ -111,15 +110,16 @@ class BlendBackward {
  private:
   void check_lists_of_forward() const;
   void check_layers() const;
-  Tensor plane(const MaybeTensor& t, int64_t channels) const;
+  Tensor plane(const MaybeTensor& t, Sizes sizes) const;
 
   std::array<Tensor, kKept> kept_;
   gs::Image image_;
   Tensor color_, alpha_, depth_, table_;
 };
 
-// Where the gradients of a scene come from: what a forward has kept (BlendBackward), or gradient rows, then `source` is
-// splats, tile_counts, rows and counts, and there are no gradients of planes.
+// Where the gradients of a scene come from: what a forward has kept (BlendBackward); or gradient rows, then `source` is
+// splats, tile_counts, rows and counts, and there are no gradients of planes; or splats, tile_counts and their moments,
+// which have no absolute gradients and take no step.
 class GradientSource {
  public:
   // absolute: whether rows have the values of absolute gradients. lengths: whether these are asked for.
@@ -151,7 +151,7 @@ class GradientSource {
 
   std::optional<BlendBackward> blend_;
   gs::Image image_;
-  Tensor splats_, tile_counts_, rows_, counts_;
+  Tensor splats_, tile_counts_, rows_, counts_, moments_;
 };
 
 // Refuses a scene whose camera gets no gradient.

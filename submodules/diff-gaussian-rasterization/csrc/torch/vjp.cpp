@@ -33,11 +33,12 @@ std::tuple<Tensor, Tensor> blend_rows_op(SOURCE_PARAMETERS, bool absolute) {
 }
 
 // What blocks of gs::kSleepBlock Gaussians add to the gradients of the camera's numbers, (blocks, numbers) float64
-// (math/camera_gradient.h), from splats, tile_counts, and the rows and counts of blend_rows.
+// (math/camera_gradient.h), from splats, tile_counts, and the rows and counts of blend_rows, or moments.
 Tensor camera_vjp_op(SCENE_PARAMETERS, List<Tensor> source, bool absolute) {
   const SceneTensors scene(SCENE_ARGUMENTS);
   check_camera_gradients(scene);
-  GS_CHECK_VALUE(source.size() == 4, "camera_vjp takes splats, tile_counts, rows and counts, got ", source.size(),
+  GS_CHECK_VALUE(source.size() == 3 || source.size() == 4,
+                 "camera_vjp takes splats, tile_counts, and rows and counts or moments, got ", source.size(),
                  " tensors");
   const GradientSource from(scene, source, {}, {}, {}, absolute, false);
   const int64_t numbers = scene.has_lens() ? baseline::kLensCameraNumbers : baseline::kPinholeNumbers;

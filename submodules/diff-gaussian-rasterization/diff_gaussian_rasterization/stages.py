@@ -1,0 +1,234 @@
+"""An image of channels in three stages, each a function of autograd: projection, description, blending.
+
+Blending sends back to `splats` no gradient of their values but moments (csrc/math/footprint.h), from which projection
+makes gradients without loss. What it sends to the description is the same once more, as gradients of means, conics and
+opacities, so that hooks see them. Only what somebody adds to these is turned into moments on the way back.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.autograd import Function
+
+from diff_gaussian_rasterization.backend import OPERATORS
+from diff_gaussian_rasterization.first_order import direct_apply, first_order
+
+_TENSORS = 11  # of a Scene, which come first
+_TWO_LN2 = 1.3862943611198906
+_ROW_Z, _SHIFT_Z = slice(6, 9), 11  # of the camera's numbers (camera.py)
+
+
+class Blending(NamedTuple):
+    """How alphas are blended, and what else is wanted."""
+
+    size: tuple[int, int]  # height, width
+    cap: float  # the largest alpha
+    stops: bool  # whether gradients end there
+    colored: bool = False  # whether colours come before the features
+    absolute: bool = False  # whether absolute gradients are wanted
+    channels_last: bool = False  # images (1, H, W, C) and alphas (1, H, W, 1), else (C, H, W) and transmittance
+
+
+class Shared:
+    """What an image's stages tell each other during a backward pass."""
+
+    __slots__ = ("lengths", "moments", "sent", "task", "use_lengths")
+
+    def __init__(self) -> None:
+        self.lengths: Tensor | None = None  # of absolute gradients, (N,)
+        self.use_lengths: Callable[[Tensor], None] | None = None
+        self.task = self.moments = self.sent = None
+
+    def send(self, moments: Tensor, gradients: Sequence[Tensor]) -> None:
+        """Keep what the description will get, to recognise it."""
+        self.task, self.moments = torch._C._current_graph_task_id(), moments
+        self.sent = [(values.data_ptr(), values._version) for values in gradients]
+
+    def take(self) -> tuple[Tensor | None, list]:
+        """What was sent in this pass: its moments, and the marks of its gradients."""
+        now = self.task is not None and self.task == torch._C._current_graph_task_id()
+        found = (self.moments, self.sent) if now else (None, [])
+        self.task = self.moments = self.sent = None
+        return found
+
+
+class _Projected(Function):
+    """Inputs: `Shared`, the camera's numbers, means2d, `Scene`'s. Results: those of the operator `project`."""
+
+    @staticmethod
+    def forward(ctx: Any, shared: Shared, camera: Tensor | None, means2d: Tensor | None, *scene: Any) -> tuple:
+        with torch._C._AutoDispatchBelowAutograd():
+            splats, depths, *others = OPERATORS.project(*scene)
+        ctx.shared, ctx.numbers = shared, scene[_TENSORS:]
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*scene[:_TENSORS], splats, others[1])
+        ctx.mark_non_differentiable(*others)
+        return splats, depths, *others
+
+    @staticmethod
+    @first_order("rasterize_channels")
+    def backward(ctx: Any, moments: Tensor | None, of_depth: Tensor | None, *_: Any) -> tuple:
+        needed, saved = ctx.needs_input_grad, ctx.saved_tensors
+        results, scene = [None] * len(needed), (*saved[:_TENSORS], *ctx.numbers)
+        splats, tile_counts = saved[_TENSORS:]
+        source = splats, tile_counts, torch.zeros_like(splats) if moments is None else moments
+        means, to_view = scene[0], scene[8].to(splats)[:3, 2]
+        if needed[1]:
+            results[1] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, source))
+            if of_depth is not None:
+                results[1][_ROW_Z] += of_depth @ means
+                results[1][_SHIFT_Z] += of_depth.sum()
+        wanted = needed[2 : 3 + 8]
+        if any(wanted):
+            found = OPERATORS.rasterize_vjp(*scene, wanted, source)
+            results[2 : 3 + 8] = [gradient if want else None for gradient, want in zip(found, wanted, strict=True)]
+            if wanted[0] and ctx.shared.lengths is not None:
+                results[2][:, 2] = ctx.shared.lengths
+            if wanted[1] and of_depth is not None:
+                results[3].addr_(of_depth, to_view)
+        return tuple(results)
+
+
+class _Described(Function):
+    """Inputs: `Shared`, whether rows are packed, splats, depths, tile_counts.
+
+    Results (1, N, ...), or of the rows that are shown: radii, means2d, depths, conics, opacities, tiles, then the rows.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, shared: Shared, packed: bool, splats: Tensor, depths: Tensor, tile_counts: Tensor
+    ) -> tuple[Tensor | None, ...]:
+        with torch._C._AutoDispatchBelowAutograd():
+            *found, tiles, rows = OPERATORS.describe(splats, depths, tile_counts, packed)
+        if packed:
+            found.append(tiles)
+        else:
+            found, rows = [values[None] for values in (*found, tile_counts)], None
+        ctx.shared = shared
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(splats, tile_counts, rows)
+        ctx.mark_non_differentiable(found[0], found[5])
+        if packed:
+            ctx.mark_non_differentiable(rows)
+        return *found, rows
+
+    @staticmethod
+    @first_order("rasterization")
+    def backward(ctx: Any, _: Any, centers: Tensor, of_depth: Tensor, conics: Tensor, opacities: Tensor, *__) -> tuple:
+        splats, tile_counts, rows = ctx.saved_tensors
+        moments, marks = ctx.shared.take()
+        given, added = [centers, conics, opacities], None
+        if [None if values is None else (values.data_ptr(), values._version) for values in given] != marks:
+            sent = [0] * 3 if moments is None else _screen(splats, tile_counts, moments, rows)
+            more = [(0 if got is None else got) - own for got, own in zip(given, sent, strict=True)]
+            more = [_dense(part, rows, splats) if isinstance(part, Tensor) else part for part in more]
+            added = _moments(splats, tile_counts, *more)
+        if of_depth is not None:
+            of_depth = torch.where(tile_counts > 0, _dense(of_depth, rows, splats), 0)
+        return None, None, added, of_depth, None
+
+
+def _screen(splats: Tensor, tile_counts: Tensor, moments: Tensor, rows: Tensor | None) -> Sequence[Tensor]:
+    """Gradients of means2d, conics and opacities, as they are described."""
+    found = OPERATORS.describe_vjp(splats, tile_counts, moments, rows)
+    return [values[None] for values in found] if rows is None else found
+
+
+def _dense(packed: Tensor, rows: Tensor | None, splats: Tensor) -> Tensor:
+    """A value for each Gaussian, of a gradient of `_Described`."""
+    if rows is None:
+        return packed[0]
+    return packed.new_zeros(len(splats), *packed.shape[1:]).index_copy_(0, rows, packed)
+
+
+def _moments(splats: Tensor, tile_counts: Tensor, centers: Tensor, conics: Tensor, opacities: Tensor) -> Tensor | None:
+    """The moments of which these are the gradients; the way back of the operator `describe_vjp`. 0: none is given."""
+    out = torch.zeros_like(splats)
+    l11, l12, l22 = splats[:, 2].abs(), splats[:, 3], splats[:, 4]
+    if isinstance(opacities, Tensor):
+        out[:, 0] = opacities * splats[:, 5].exp2()
+    if isinstance(centers, Tensor):
+        out[:, 1] = centers[:, 0] / (_TWO_LN2 * l11)
+        out[:, 2] = (centers[:, 1] / _TWO_LN2 - l12 * out[:, 1]) / l22
+    if isinstance(conics, Tensor):
+        xx, xy, yy = -2 * conics[:, 0], -conics[:, 1], -2 * conics[:, 2]
+        out[:, 3] = l11 * l11 * xx + 2 * l11 * l12 * xy + l12 * l12 * yy
+        out[:, 4], out[:, 5] = l22 * (l11 * xy + l12 * yy), l22 * l22 * yy
+    return torch.where((tile_counts > 0)[:, None], out, 0)
+
+
+class _Blended(Function):
+    """Inputs: `Shared`, `Blending`, whether a backward follows, order (N,), rects, tile_counts, rows that are shown or
+    None, splats, then means2d, conics, opacities and depths as described, or None, features (N, F) or None, and the
+    background. Channels: colours, features, then depths, if they are described; they are blended as `order` has them.
+    Results: image and transmittance or alpha, and the lists: instances and ranges.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, shared: Shared, how: Blending, train: bool, order: Tensor, rects: Tensor, tile_counts: Tensor,
+        rows: Tensor | None, splats: Tensor, means2d: Tensor | None, conics: Tensor | None, opacities: Tensor | None,
+        depths: Tensor | None, features: Tensor | None, background: Tensor,
+    ) -> tuple[Tensor, ...]:  # fmt: skip
+        with torch._C._AutoDispatchBelowAutograd():
+            lists = OPERATORS.bin(splats, order, rects, tile_counts, *how.size, train)
+            parts = [splats[:, 6:9]] if how.colored else []
+            parts += [part for part in (features, None if depths is None else order[:, None]) if part is not None]
+            values = parts[0] if len(parts) == 1 else torch.cat(parts, 1)
+            behind = background.expand(values.shape[1])
+            image, transmittance, last, alpha = OPERATORS.blend_channels(
+                splats, values, *lists[:2], behind, *how.size, how.cap, how.channels_last
+            )
+            kept = splats, tile_counts, *lists, last, splats.new_empty(0), behind, transmittance
+            alpha = alpha if how.channels_last else transmittance
+        ctx.shared, ctx.how, ctx.background = shared, how, background.shape
+        ctx.widths = 3 * how.colored, 0 if features is None else features.shape[1]
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(rows, values, *kept)
+        ctx.mark_non_differentiable(*lists[:2])
+        return image, alpha, *lists[:2]
+
+    @staticmethod
+    @first_order("rasterize_channels")
+    def backward(ctx: Any, of_image: Tensor | None, of_alpha: Tensor | None, *_: Any) -> tuple:
+        (rows, values, *kept), how, needed = ctx.saved_tensors, ctx.how, ctx.needs_input_grad
+        splats, tile_counts, transmittance, shared = kept[0], kept[1], kept[9], ctx.shared
+        last = how.channels_last
+        if of_image is None:
+            of_image, last = splats.new_zeros(values.shape[1], *how.size), False
+        elif last and not of_image.is_contiguous():
+            of_image, last = of_image[0].permute(2, 0, 1), False  # the order that it most likely has
+        if how.channels_last and of_alpha is not None:
+            of_alpha = -of_alpha[..., 0]
+        results = [None] * len(needed)
+        moments, lengths, of_values = OPERATORS.channel_moments(
+            kept, values, of_image, of_alpha, how.cap, how.stops, how.absolute, needed[11] or needed[12], last
+        )
+        results[7] = moments
+        if how.absolute:
+            shared.lengths = lengths
+            if shared.use_lengths:
+                shared.use_lengths(lengths)
+        if needed[8]:
+            screen = _screen(splats, tile_counts, moments, rows)
+            shared.send(moments, screen)
+            results[8:11] = screen
+        first, count = ctx.widths
+        if needed[11]:
+            results[11] = _packed(of_values[:, -1], rows)
+        if needed[12]:
+            results[12] = of_values if of_values.shape[1] == count else of_values[:, first : first + count]
+        if needed[13]:
+            planes = of_image[0].permute(2, 0, 1) if last else of_image
+            results[13] = torch.mv(planes.flatten(1), transmittance.flatten()).sum_to_size(ctx.background)
+        return tuple(results)
+
+
+def _packed(values: Tensor, rows: Tensor | None) -> Tensor:
+    return values[None] if rows is None else values[rows]
+
+
+projected, described, blended = map(direct_apply, (_Projected, _Described, _Blended))
