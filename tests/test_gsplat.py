@@ -12,7 +12,8 @@ import pytest
 import scipy.special
 import torch
 from diff_gaussian_rasterization import gsplat_programs
-from diff_gaussian_rasterization.gsplat import MODES, rasterization
+from diff_gaussian_rasterization.gsplat import rasterization
+from diff_gaussian_rasterization.gsplat_inputs import MODES
 from diff_gaussian_rasterization.harmonics import sh_basis
 from rasterizer_tools import CPU_AND_GPU
 from torch import Tensor

@@ -19,37 +19,18 @@ from torch.utils.weak import TensorWeakRef
 from diff_gaussian_rasterization.alternatives import MOST_BANDS, MOST_DEGREE
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.channels import MOST_CHANNELS
-from diff_gaussian_rasterization.checks import check_tensors, whole_number
 from diff_gaussian_rasterization.first_order import needs_function
+from diff_gaussian_rasterization.gsplat_inputs import Call, Item, checked, items_of
 from diff_gaussian_rasterization.gsplat_meta import Meta
 from diff_gaussian_rasterization.harmonics import sh_values
 from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.stages import Blending, Shared, blended, described, projected
 
-MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-_CHOICES = {
-    "render_mode": MODES,
-    "camera_model": ("pinhole", "fisheye", "ortho"),
-    "rasterize_mode": ("classic", "antialiased"),
-}
 _ENDLESS = 1e10  # far_plane, if nobody gives one
 _MOST_ALPHA = 0.999
 _FLAT = 2.0**-40  # of depth
-_TILE = 16  # px
 _NO_CONTEXT = contextlib.nullcontext()
 _NUMBERS = {False: 10, True: 19}  # of a camera beyond its pose (camera.py), of a pinhole and of a lens
-_NO_UT = "take camera_model='fisheye', or a Lens with rasterize_channels"
-_NO_RAYS = "take projection='ray' with rasterize"
-_UNSUPPORTED = {
-    "distributed": "train with torchrun and train.py",
-    **dict.fromkeys(("with_eval3d", "return_normals", "rays"), _NO_RAYS),
-    **dict.fromkeys(
-        ("with_ut", "ut_params", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs", "ftheta_coeffs",
-         "lidar_coeffs", "external_distortion_coeffs", "viewmats_rs"), _NO_UT,
-    ),
-}  # fmt: skip
-_NEEDED = {"means": "(..., N, 3)", "viewmats": "(..., C, 4, 4)"}
-_OTHERS = ("quats", "scales", "opacities", "colors", "Ks", "backgrounds", "covars", "extra_signals")
 
 
 class _Fisheye(Lens):
@@ -58,41 +39,6 @@ class _Fisheye(Lens):
     def numbers(self, width: int, height: int) -> tuple[float, ...]:
         chart, _, reach, _, *rest = super().numbers(width, height)
         return chart, (math.pi / 2) ** 2, reach, math.pi / 2, *rest
-
-
-class _Call(NamedTuple):
-    """What all images of a call share."""
-
-    size: tuple[int, int]  # height, width
-    degree: int | None  # of SH
-    signal_degree: int | None
-    colored: bool  # whether colours are shown, and below, whether depths are
-    deep: bool
-    mean_depth: bool  # depths over alpha
-    antialiased: bool
-    eps2d: float  # px^2
-    clip: float  # px
-    near: float
-    far: float
-    model: str
-    by_z: bool  # depths are along the axis, else distances
-    packed: bool
-    absgrad: bool
-
-
-class _Item(NamedTuple):
-    """The Gaussians and the camera of an image."""
-
-    means: Tensor
-    quats: Tensor | None
-    scales: Tensor | None
-    covars: Tensor | None  # (N, 6)
-    opacities: Tensor
-    colors: Tensor | None  # (N, D), or SH (N, K, D)
-    signals: Tensor | None  # the same
-    view: Tensor  # (4, 4) world to view
-    K: Tensor  # (3, 3)
-    background: Tensor | None  # (D,)
 
 
 class _Projection(NamedTuple):
@@ -179,8 +125,8 @@ def rasterization(
     meta["means2d"].absgrad, of at most 32 channels; x has the length of x and y in NDC, times 2 / width, and y is 0.
     Returns images (..., C, H, W, D), alphas (..., C, H, W, 1), and meta. ValueError: what cannot be drawn.
     """
-    call, backgrounds, tile = _checked(locals())
-    given = _Item(means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds)
+    call, backgrounds, tile = checked(locals())
+    given = Item(means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds)
     with _without_autocast(means.device.type):  # whose products of matrices are of 8 or 11 bits
         return _rendered(call, given, tile, sparse_grad)
 
@@ -189,7 +135,7 @@ def _without_autocast(device: str) -> contextlib.AbstractContextManager:
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else _NO_CONTEXT
 
 
-def _rendered(call: _Call, given: _Item, tile: int, sparse: bool) -> tuple[Tensor, Tensor, Meta]:
+def _rendered(call: Call, given: Item, tile: int, sparse: bool) -> tuple[Tensor, Tensor, Meta]:
     shown: list[Tensor] = []
     if sparse:
         if not call.packed or given.means.dim() != 2:
@@ -197,7 +143,7 @@ def _rendered(call: _Call, given: _Item, tile: int, sparse: bool) -> tuple[Tenso
         rows = {name: getattr(given, name) for name in ("means", "quats", "scales")}
         given = given._replace(**{name: None if t is None else _Sparse.apply(t, shown) for name, t in rows.items()})
     form = *given.means.shape[:-2], given.view.shape[-3] if given.view.dim() > 2 else 1
-    items = _items(call, given, form)
+    items = items_of(call, given, form)
     projections = [_project(call, item) for item in items]
     notes, pieces = _joined(call, [one.notes for one in projections], form)
     drawn = [_blend(call, *one) for one in zip(items, projections, pieces, strict=True)]
@@ -216,120 +162,7 @@ def _together(parts: Sequence[Tensor], form: tuple[int, ...]) -> Tensor:
     return whole if len(form) == 1 else whole.unflatten(0, form)
 
 
-def _checked(given: dict[str, Any]) -> tuple[_Call, Tensor | None, int]:
-    """The arguments of `rasterization`, backgrounds and tile_size apart. ValueError, or TypeError, for wrong ones."""
-    for name, remedy in _UNSUPPORTED.items():
-        if given[name] is not None and given[name] is not False:
-            raise ValueError(f"{name} is not supported; {remedy}")
-    _check_renderer(given["renderer_config"])
-    shutter, eps2d, mode = given["rolling_shutter"], given["eps2d"], given["render_mode"]
-    check_tensors({name: given[name] for name in (*_NEEDED, *_OTHERS)})
-    for name, shape in _NEEDED.items():
-        if (found := given[name]) is None or found.dim() < 2:
-            raise ValueError(f"{name} must be {shape}, got {None if found is None else tuple(found.shape)}")
-    if shutter is not None and getattr(shutter, "name", "GLOBAL") != "GLOBAL":
-        raise ValueError("rolling_shutter is not supported; take poses of a global shutter")
-    if mode in ("d", "Ed", "RGB-d", "RGB-Ed"):
-        raise ValueError(
-            f"render_mode {mode!r} needs with_eval3d, which is not supported; take {mode.upper()!r}".replace("-", "+")
-        )
-    for name, choices in _CHOICES.items():
-        if given[name] not in choices:
-            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {given[name]!r}")
-    if not 0 <= eps2d <= 1:
-        raise ValueError(f"eps2d must be 0 to 1 px^2, got {eps2d}")
-    degrees = [
-        None if given[name] is None else whole_number(name, given[name], 0)
-        for name in ("sh_degree", "extra_signals_sh_degree")
-    ]
-    behind, means = given["backgrounds"], given["means"]
-    if given["packed"] and behind is not None and behind.dim() == 1:  # gsplat's rows that are packed have no cameras
-        behind = behind.expand(*means.shape[:-2], *given["viewmats"].shape[-3:-2], -1)
-    width, height = (whole_number(name, given[name]) for name in ("width", "height"))
-    tile = _TILE if given["tile_size"] is None else whole_number("tile_size", given["tile_size"])
-    call = _Call(
-        (height, width), *degrees, mode.startswith("RGB"), mode.endswith("D"), mode.endswith("ED"),
-        given["rasterize_mode"] == "antialiased", float(eps2d), given["radius_clip"], float(given["near_plane"]),
-        given["far_plane"], given["camera_model"], bool(given["global_z_order"]), bool(given["packed"]),
-        bool(given["absgrad"]),
-    )  # fmt: skip
-    return call, behind, tile
-
-
-def _check_renderer(config: Any) -> None:
-    """gsplat's classes, by their names: only its default is one for images without rays."""
-    name = type(config).__name__
-    if config is None or name == "RendererConfig_MixedBatch":
-        return
-    if all(base.__name__ != "RendererConfig" for base in type(config).__mro__):
-        raise TypeError(f"renderer_config must be a RendererConfig or None, got {name}")
-    if name != "RendererConfig_ParallelBatch":
-        raise NotImplementedError(f"there is no renderer of {name}")
-    raise ValueError(f"renderer_config {name} needs with_eval3d=True, which is not supported; {_NO_RAYS}")
-
-
-def _items(call: _Call, given: _Item, form: tuple[int, ...]) -> list[_Item]:
-    """The images. ValueError for tensors of wrong shapes or dtypes."""
-    if not all(form):
-        raise ValueError(f"there must be an image to render, got batches and cameras {form}")
-    if given.covars is not None:
-        given = given._replace(quats=None, scales=None)
-    given = given._replace(colors=given.colors if call.colored else None, K=given.K.detach().to(given.means.device))
-    _check_shapes(call, given, form)
-    if given.covars is not None:
-        upper = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
-        given = given._replace(covars=torch.stack([given.covars[..., i, j] for i, j in upper], -1))
-    *batch, cameras = form
-    axes = 2, 2, 2, 2, 1, 2 + (call.degree is not None), 2 + (call.signal_degree is not None), 2, 2, 1
-    images = []
-    for place in range(math.prod(batch)):
-        own = [_part(values, len(batch), n, place) for values, n in zip(given, axes, strict=True)]
-        for camera in range(cameras):
-            of_camera = (v if v is None or v.dim() == n else v[camera] for v, n in zip(own, axes, strict=True))
-            images.append(_Item(*of_camera))
-    return images
-
-
-def _part(values: Tensor | None, batch: int, axes: int, place: int) -> Tensor | None:
-    """What a batch has of values with so many leading axes; all, where they are not of batches."""
-    if values is None or not batch or values.dim() == axes:
-        return values
-    return values.flatten(0, batch - 1)[place]
-
-
-def _check_shapes(call: _Call, given: _Item, form: tuple[int, ...]) -> None:
-    batch, means = (form[:-1],), given.means
-    count, each, both = means.shape[-2], (form,), (form[:-1], form)
-    shapes = [("means", means, batch, (count, 3)), ("opacities", given.opacities, batch, (count,))]
-    shapes += [("viewmats", given.view, each, (4, 4)), ("Ks", given.K, each, (3, 3))]
-    if given.covars is None:
-        shapes += [("quats", given.quats, batch, (count, 4)), ("scales", given.scales, batch, (count, 3))]
-    else:
-        shapes.append(("covars", given.covars, batch, (count, 3, 3)))
-    for name, values, degree in (
-        ("colors", given.colors, call.degree),
-        ("extra_signals", given.signals, call.signal_degree),
-    ):
-        if values is None and (name == "extra_signals" or not call.colored):
-            continue
-        if values is None or values.dim() < 2:
-            raise ValueError(f"{name} must be (..., N, D), got {None if values is None else tuple(values.shape)}")
-        harmonic = degree is not None
-        shapes.append((name, values, ((), *both) if harmonic else both, (count, *values.shape[-1 - harmonic :])))
-        if harmonic and values.shape[-2] < (degree + 1) ** 2:
-            raise ValueError(f"{name} of degree {degree} must have {(degree + 1) ** 2} bands, got {values.shape[-2]}")
-    if given.background is not None:
-        shapes.append(("backgrounds", given.background, each, given.background.shape[-1:]))
-    for name, values, leads, tail in shapes:
-        if values is None or all(values.shape != (*lead, *tail) for lead in leads):
-            raise ValueError(
-                f"{name} must be {(*leads[0], *tail)}, got {None if values is None else tuple(values.shape)}"
-            )
-        if values.dtype != means.dtype and name not in ("Ks", "backgrounds"):
-            raise ValueError(f"{name} must be {means.dtype} like means, got {values.dtype}")
-
-
-def _project(call: _Call, item: _Item) -> _Projection:
+def _project(call: Call, item: Item) -> _Projection:
     view, near = item.view, call.near
     if call.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
         view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
@@ -365,7 +198,7 @@ def _project(call: _Call, item: _Item) -> _Projection:
     return _Projection(shared, splats, degree is not None, shown, depth.detach(), rects, counts, tuple(notes), rows)
 
 
-def _lens(call: _Call, K: Tensor) -> tuple[float, ...]:
+def _lens(call: Call, K: Tensor) -> tuple[float, ...]:
     """The first numbers of Scene.lens. Of a pinhole no number goes to the host, which would wait for it."""
     if call.model == "pinhole":
         return 0.0, 0.0, 1.0
@@ -383,14 +216,14 @@ def _numbers(view: Tensor, centered: bool, lens: bool) -> Tensor:
     return torch.cat([view[:3, :3].reshape(9), view[:3, 3], center, view.new_zeros(_NUMBERS[lens])])
 
 
-def _depth(call: _Call, item: _Item) -> Tensor | None:
+def _depth(call: Call, item: Item) -> Tensor | None:
     """Depths (N,) where they are not those that the kernels find."""
     if not call.by_z:
         return torch.linalg.vector_norm(item.means @ item.view[:3, :3].T + item.view[:3, 3], dim=1)
     return None if call.model == "pinhole" else item.means @ item.view[2, :3] + item.view[2, 3]
 
 
-def _shown(item: _Item, values: Tensor, degree: int | None, least: float) -> Tensor:
+def _shown(item: Item, values: Tensor, degree: int | None, least: float) -> Tensor:
     """Values (N, D), or what SH (N, K, D) are in the directions from the camera, at least `least`."""
     if degree is None:
         return values
@@ -405,7 +238,7 @@ def _black(device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 def _joined(
-    call: _Call, notes: Sequence[tuple[Tensor, ...]], form: tuple[int, ...]
+    call: Call, notes: Sequence[tuple[Tensor, ...]], form: tuple[int, ...]
 ) -> tuple[list[Tensor], list[tuple[Tensor, ...]]]:
     """The notes of all images, and of each image what these are made of, so that images are made of the notes."""
     if len(notes) == len(form) == 1:
@@ -419,7 +252,7 @@ def _joined(
 
 
 def _blend(
-    call: _Call, item: _Item, of: _Projection, notes: tuple[Tensor, ...]
+    call: Call, item: Item, of: _Projection, notes: tuple[Tensor, ...]
 ) -> tuple[Tensor, Tensor, Tensor | None, list[Tensor]]:
     """Image (1, H, W, D), alpha (1, H, W, 1), signals (1, H, W, E), and the lists of tiles."""
     width = 0 if item.colors is None else item.colors.shape[-1]
@@ -449,7 +282,7 @@ def _blend(
 
 
 def _meta(
-    call: _Call,
+    call: Call,
     notes: list[Tensor],
     lists: Sequence[tuple[Tensor, ...]],
     projections: Sequence[_Projection],
