@@ -1,0 +1,115 @@
+"""Images without gradients, of SH of degree 3: gsplat's function and ours, our rasterizer, and gsplat's HiGS.
+
+    python -m benchmarks.peers.images [--workloads S M M+ 4K L XL]
+
+Needs a GPU and gsplat 1.6 with its experimental kernels; what fails is left out, and named. Milliseconds by events,
+of the kernels alone, and of the host until the call returns; and how far an image is from ours, as PSNR (dB). Random
+splats in a frustum, in Morton order.
+"""
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization.gsplat import rasterization as ours
+from torch import Tensor
+
+from benchmarks.harness.measuring import REPEATS, describe, gpu_time, print_table
+from benchmarks.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from utils.system_utils import UserError, run_cli
+
+Image = Callable[[], Tensor]  # (H, W, 3)
+
+
+def images(scene: SplatScene) -> dict[str, Callable[[], Image]]:
+    """What makes each way to draw a scene, by name."""
+    import gsplat
+
+    given, camera = scene.parameters, scene.settings(torch.float32)
+    width, height = camera.image_width, camera.image_height
+    focal = width / (2 * camera.tanfovx), height / (2 * camera.tanfovy)
+    K = torch.tensor([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]], device=given["means"].device)
+    view, sh = camera.viewmatrix.T.contiguous(), torch.cat([given["sh_dc"], given["sh_rest"]], 1).contiguous()
+    quats = torch.nn.functional.normalize(given["rotations"])
+    shape = quats, given["scales"].exp(), given["opacities"].sigmoid().flatten()
+
+    def by_function(function: Callable, packed: bool) -> Callable[[], Image]:
+        inputs = given["means"], *shape, sh, view[None], K[None], width, height
+        return lambda: lambda: function(*inputs, sh_degree=3, packed=packed)[0][0]
+
+    def by_rasterize() -> Image:
+        zeros = torch.zeros_like(given["means"])
+        settings = camera._replace(bg=camera.bg * 0)
+        return lambda: rasterize(means2d=zeros, settings=settings, raw=True, **given).color.permute(1, 2, 0)
+
+    def by_higs(tile: int, compression: str) -> Callable[[], Image]:
+        def made() -> Image:
+            from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
+
+            packed = GaussianInferenceScene.from_gaussian_tensors(
+                given["means"], *shape, sh, sh_degree=3, sh_compression=compression, id=f"{tile} {compression}"
+            )
+            renderer = GaussianInferenceRenderer(packed, tile_size=tile)
+            return lambda: renderer.render(viewmat=view, K=K, width=width, height=height).frame[0, ..., :3]
+
+        return made
+
+    found = {"rasterize": by_rasterize}
+    for name, function in (("ours", ours), ("gsplat", gsplat.rasterization)):
+        found |= {
+            f"{name}, {'packed' if packed else 'dense'}": by_function(function, packed) for packed in (False, True)
+        }
+    return found | {f"HiGS {tile}, {kind}": by_higs(tile, kind) for tile in (8, 16) for kind in ("none", "16b")}
+
+
+def host_milliseconds(draw: Image) -> float:
+    """The median time until a call on an idle device returns."""
+    times = []
+    for _ in range(REPEATS):
+        torch.cuda.synchronize()
+        begin = time.perf_counter()
+        draw()
+        times.append(1e3 * (time.perf_counter() - begin))
+    return statistics.median(times)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument(
+        "--workloads", nargs="+", choices=GPU_WORKLOADS, default=list(GPU_WORKLOADS), help="(default: all)"
+    )
+    args = parser.parse_args()
+    if not torch.cuda.is_available():
+        raise UserError("this needs a GPU")
+    try:
+        import gsplat
+    except ModuleNotFoundError as error:
+        raise UserError(f"{error}; install gsplat 1.6") from error
+    print(f"{describe('cuda')}, gsplat {gsplat.__version__}", end="\n\n")
+    rows = []
+    with torch.no_grad():
+        for workload in args.workloads:
+            wanted = None
+            for name, make in images(in_morton_order(frustum(*GPU_WORKLOADS[workload], device="cuda"))).items():
+                try:
+                    draw = make()
+                    image = draw().float().clone()
+                except Exception as error:  # of foreign code
+                    print(f"{workload}, {name}: {error!r:.200}")
+                    continue
+                wanted = image if wanted is None else wanted
+                psnr = -10 * (image - wanted).square().mean().log10().item()
+                times = gpu_time(draw)
+                rows.append(
+                    [workload, name, *(f"{ms:.3f}" for ms in (times.events, times.kernels, host_milliseconds(draw)))]
+                )
+                rows[-1].append(f"{psnr:.1f}")
+                del draw
+    print_table(["workload", "by", "events", "kernels", "host", "PSNR to ours"], rows)
+
+
+if __name__ == "__main__":
+    run_cli(main)
