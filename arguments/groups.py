@@ -43,7 +43,12 @@ class ModelParams(OptionTable):
                  "memory, the host's memory holds them, and each is copied to the GPU before it is used. Without a "
                  "usable GPU, cuda means cpu"),
         Option("eval", False, stored=CFG_ARGS, topic=MOST_NEEDED,
-            help="hold out every 8th photo by name, or Blender's test frames, to test the model"),
+            help="hold out photos as --holdout says, or Blender's test frames, to test the model"),
+        Option("holdout", "every8", origin="ours", check=one_of("every8", "sector", "block"), stored=MODEL_JSON,
+            topic="data",
+            help="photos that --eval holds out. every8: every 8th by name; sector: an eighth, side by side around what "
+                 "the cameras look at; block: an eighth in succession by name. The last two leave a gap, so scores are "
+                 "of views that no photo is close to"),
         Option("init_pcd_path", "", origin="ours", topic="data",
             help="file of points to start from instead of the scene's own: PLY, npz (points, colors), or text with "
                  "x y z or x y z red green blue in each line"),

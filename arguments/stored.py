@@ -23,7 +23,8 @@ _OF_TRAINING = {option.name: option.default for option in OPTIONS if not option.
 # Options of a model that change no picture, or whose change of it has a name of its own.
 _UNSEEN = {"sh_degree", "source_path", "model_path", "data_device", "seed", "optimizer_type"}
 _UNSEEN |= {option.name for option in OPTIONS if not option.seen}
-VIEW_OPTIONS = frozenset(_IN_CFG_ARGS.keys() - _UNSEEN)  # of the views, for all saves of a model folder alike
+# Of the views, for all saves of a model folder alike.
+VIEW_OPTIONS = frozenset((_IN_CFG_ARGS.keys() | {"holdout"}) - _UNSEEN)
 _OF_MODEL = {option.name for option in ModelParams.options if option.stored == MODEL_JSON}
 
 

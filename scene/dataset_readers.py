@@ -21,6 +21,7 @@ from scene.colmap_loader import Camera, Image
 from scene.images.masks import NO_MASKS, MaskOptions
 from scene.readers.colmap import colmap_camera, read_colmap
 from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, with_depth_maps, with_map
+from scene.readers.holdout import EVERY, refuse_rule
 from scene.readers.info import (
     HOLD,
     CameraInfo,
@@ -61,6 +62,7 @@ def read_scene(
     offset: Sequence[float] | None = None,
     kind: str | None = None,
     native: bool = False,
+    rule: str = EVERY,
 ) -> SceneInfo:
     """Read the dataset in a folder, of any kind. UserError says what was looked for and what was found.
 
@@ -71,10 +73,16 @@ def read_scene(
     kind: of the folder (`kind_of`), where it is known.
     native: take photos of distorting lenses as they are, where the rasterizer knows the camera model. Others are
     undistorted into the user's cache folder; nothing else is written.
+    rule: which photos are held out (scene/readers/holdout.py), where the dataset does not list them.
     """
+    if rule != EVERY and not hold_out:
+        raise UserError(f"--holdout {rule} holds photos out only with --eval; give --eval, too")
     start = StartOptions(init_pcd_path, init_type) if want_cloud else None
     kind = kind or kind_of(source_path)
-    more = {"native": True} if native and kind != BLENDER else {}  # Blender's cameras have no lens
+    more = {"native": native, "rule": rule}
+    if kind == BLENDER:
+        refuse_rule(rule, Path(source_path) / "transforms_test.json")
+        more = {}  # its cameras have no lens
     info = _READERS[kind](Path(source_path), images, hold_out, start, masks, **more)
     return local(info, world_offset(info) if offset is None else np.asarray(offset, dtype=np.float64))
 

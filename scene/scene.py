@@ -125,7 +125,7 @@ class Scene:
                 offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
                 kind=kind,
                 native=getattr(args, "lenses", "") == "native",
-                **_given(args, init_pcd_path="init_pcd_path", init_type="init_type"),
+                **_given(args, init_pcd_path="init_pcd_path", init_type="init_type", rule="holdout"),
             )
             if fresh:
                 check_masks([(view.image_path, view.mask) for view in info.train_cameras + info.test_cameras], masks)

@@ -46,6 +46,7 @@ ABSURD = {
     "sh_degree": "4 -1", "resolution": "0 -2", "images_to_load": "-1", "iterations": "-5 0 2147483648",
     "position_lr_init": "nan", "opacity_lr": "-0.1", "scaling_lr": "inf", "lambda_dssim": "1.5",
     "densification_interval": "0", "densify_grad_threshold": "0", "max_num_splats": "-1", "seed": "-1",
+    "holdout": "every9",
     "optimizer_type": "sgd", "strategy": "mine", "absgrad_threshold": "0 nan",
     "projection": "affine", "robust_mask": "0.6 -0.1", "appearance": "exposure", "sky": "blue",
     "opacity_decay": "1.01 0.4", "prune_opacity": "0.6 -0.1", "mcmc_until_iter": "-1",
@@ -170,7 +171,7 @@ def test_model_json_has_what_is_stored_there_with_sorted_keys(tmp_path):
     write_cfg_args(tmp_path, argparse.Namespace())
     del record["options"]
     defaults = {"masks": "", "mask_meaning": "auto", "lenses": "auto", "refine_poses": False,
-                "appearance": "none"}  # fmt: skip
+                "appearance": "none", "holdout": "every8"}  # fmt: skip
     assert read_stored_options(tmp_path) == {**MODEL, **record, **defaults}
 
 

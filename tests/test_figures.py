@@ -1,12 +1,15 @@
 """Figures of error against time: what is drawn, where, and by which marks it is told apart."""
 
+import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from splatting.evaluation.error_curve import COLUMNS
-from splatting.evaluation.figures import draw_curve, draw_curves
+from splatting.evaluation.figures import draw_cameras, draw_curve, draw_curves
+from splatting.evaluation.report import _from_above
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
 
@@ -95,3 +98,28 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
     assert said == ["2 of 7 test views; hollow, other programs and the end: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
+
+
+def test_cameras_from_above_are_drawn_once_for_each_split(tmp_path, drawn):
+    turn = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks along y, its head towards z
+    cameras = [{"position": [x, 2.0 * x, 9.0], "rotation": turn} for x in range(5)]
+    runs = []
+    every, block = "every 8th by name", "--holdout block"
+    for model, split, entries in (("a", every, cameras), ("b", block, cameras),
+                                  ("c", every, cameras), ("d", "other", [{"img_name": "x"}])):  # fmt: skip
+        (tmp_path / model).mkdir()
+        (tmp_path / model / "cameras.json").write_text(json.dumps(entries))
+        runs.append({"model": model, "split": split, "views": {"train": 3}})
+    splits = _from_above(tmp_path, [*runs, {"model": "gone", "split": None, "views": {"train": None}}])
+    assert {name: [len(one) for one in both] for name, both in splits.items()} == {
+        "every 8th by name": [2, 3], "--holdout block": [2, 3]}  # fmt: skip
+    test, train = splits["--holdout block"]
+    places = np.concatenate([test, train])
+    steps = np.diff(places[:, :2], axis=0)
+    assert np.allclose(np.linalg.norm(steps, axis=1), 5**0.5) and np.allclose(places[:, 2:], places[0, 2:])
+    across = steps[0, 0] * places[0, 3] - steps[0, 1] * places[0, 2]
+    assert np.isclose(across, 1) and np.isclose(steps[0] @ places[0, 2:], 2)  # not mirrored: the axis is to the left
+    files = draw_cameras(tmp_path, "attic", splits)
+    assert [file.name for file in files] == ["attic_cameras_1.png", "attic_cameras_2.png"]
+    shown = {one.get_label(): one.N for one in drawn[1].axes[0].collections}
+    assert shown == {"2 test views": 2, "3 train views": 3}

@@ -30,7 +30,10 @@ SETS = {
     ),
     "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5, "--lenses", "undistort", "--masks", "masks"),
     "poses": ("--refine_poses", "--robust_mask", 0.2, "--sky", "auto", "--strategy", "budget", "--images_to_load", 5),
-    "in PyTorch": ("--convert_SHs_python", "--compute_cov3D_python", "--strategy", "mcmc", "-i", "images/."),
+    "in PyTorch": (
+        *("--convert_SHs_python", "--compute_cov3D_python", "--strategy", "mcmc", "-i", "images/."),
+        *("--holdout", "sector"),
+    ),
     "RGBA on white": ("-w", "--mask_meaning", "ignore"),
 }
 OWN = {"ignored": 20, "ppisp": None, "affine": None, "RGBA on white": None}  # first columns that count; None: others

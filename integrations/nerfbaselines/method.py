@@ -43,7 +43,8 @@ _FIXED = dict.fromkeys(
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "keep_unseen", "prune_sh",
      *(name for part in _PARTS if part.told_last for name in part.options.by_name))
     , "",
-) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true"}  # fmt: skip
+) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true",
+     "holdout": "every8"}  # fmt: skip
 _LISTS = ("test_iterations", "save_iterations", "checkpoint_iterations")
 
 

@@ -12,7 +12,8 @@ from scene.colmap_loader import Camera, Image, Points, qvec2rotmat, read_cameras
 from scene.images.find import find_images
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.readers.info import CameraInfo, Posed, SceneInfo, split_by_order
+from scene.readers.holdout import EVERY, refuse_rule, split
+from scene.readers.info import CameraInfo, Posed, SceneInfo
 from scene.readers.photos import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
@@ -42,6 +43,7 @@ def read_colmap(
     start: StartOptions | None = OWN_POINTS,
     masks: MaskOptions = NO_MASKS,
     native: bool = False,
+    rule: str = EVERY,
 ) -> SceneInfo:
     """Read a COLMAP scene: the model, photos in `<folder>/<images>`, views sorted by name (bytes).
 
@@ -49,6 +51,8 @@ def read_colmap(
     """
     model_folder, model = find_model(folder)
     say_unread(model_folder, "colmap", _side_files(model_folder))
+    if (listed := model_folder / "test.txt").is_file():  # of the reference, whose train.py does not read it either
+        refuse_rule(rule, listed)
     if not model.images:
         raise UserError(f"the COLMAP model in {model_folder} has no registered photo; reconstruct the scene again")
     photos = sorted(model.images, key=lambda image: os.fsencode(image.name))
@@ -68,7 +72,7 @@ def read_colmap(
         colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha, native)
         for photo, path, mask in zip(photos, paths, found, strict=True)
     ]
-    views = split_by_order(finished(cameras, masks.drop_alpha), hold_out, folder)
+    views = split(finished(cameras, masks.drop_alpha), hold_out, rule, folder)
     own, lacking = partial(_own_cloud, model_folder, model), f"{listed_by} has no points"
     return scene_info(views, start, own, partial(random_in_frusta, views[0]), lacking)
 

@@ -27,6 +27,7 @@ HOLD = 8  # every 8th photo by name is a test view (Mip-NeRF 360's split)
 NEAREST = 0.2  # depth from which Gaussians are drawn (the rasterizer's rule)
 APART = 10.0  # median distances from the cameras' median, beyond which a camera stands apart
 NARROW = 1e-2  # of the depth; with a smaller E, removing Gaussians wider than 0.1 E would leave only pixel-sized ones
+_UNTURNED = 0.05  # weight of the photos' own upward axes where their sideward axes do not tell what is up
 ROUNDING = 1e-9  # distances below this part of the scene are rounding errors
 # Extents from the origin. There a step of float32 is a hundred-thousandth of the extent, many times the moves of
 # positions in the last iterations (1.6e-6 extents and less).
@@ -220,22 +221,6 @@ for record in (CameraInfo, SceneInfo):
     record._fields = tuple(item.name for item in fields(record) if not item.kw_only)
 
 
-def split_by_order(
-    cameras: list[CameraInfo], hold_out: bool, folder: Path
-) -> tuple[list[CameraInfo], list[CameraInfo]]:
-    """Training and test views: with hold_out every HOLD-th view, the first included, is a test view."""
-    train = [camera for index, camera in enumerate(cameras) if not hold_out or index % HOLD]
-    test = held_out([camera for index, camera in enumerate(cameras) if hold_out and index % HOLD == 0])
-    if not train:
-        raise UserError(f"{folder} has too few photos for --eval, which holds out every {HOLD}th; leave --eval out")
-    return train, test
-
-
-def held_out(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
-    """The views, marked as test views."""
-    return [replace(camera, is_test=True) for camera in cameras]
-
-
 def photo_size(view: CameraInfo) -> tuple[int, int]:
     """Size (width, height) of the photo of a record. Where it cannot be read, a CameraInfo's own; else UserError."""
     size, image = getattr(view, "file_size", None), getattr(view, "image", None)
@@ -314,6 +299,24 @@ def normalization(cameras: Sequence[CameraInfo], points: np.ndarray | None = Non
 def camera_centers(cameras: Sequence[CameraInfo]) -> np.ndarray:
     """Camera centres (N,3) in the world, of any records with R and T."""
     return np.array([camera_center(camera.R, camera.T) for camera in cameras])
+
+
+def up_of(turns: np.ndarray) -> np.ndarray:
+    """What is up (3,): across the photos' sideward axes, which photographers hold level, as far as these differ.
+
+    turns: (N,3,3), from camera to world axes.
+    """
+    sideward, upward = turns[:, :, 0], -turns[:, :, 1].mean(0)
+    up = np.linalg.solve(sideward.T @ sideward / len(turns) + _UNTURNED * np.eye(3), upward)
+    return up / max(np.linalg.norm(up), 1e-12)
+
+
+def from_above(up: np.ndarray) -> np.ndarray:
+    """Axes (2,3) of a picture from above: across `up` (3,), the second a quarter turn counter-clockwise."""
+    up = up / max(float(np.linalg.norm(up)), 1e-9)
+    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    first /= max(float(np.linalg.norm(first)), 1e-9)
+    return np.stack([first, np.cross(up, first)])
 
 
 def scene_extent(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> float:

@@ -17,7 +17,8 @@ from scene.images.decode import picture_sizes
 from scene.images.find import FileIndex, find_images, find_listed, identity
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
-from scene.readers.info import CameraInfo, Posed, SceneInfo, held_out, split_by_order
+from scene.readers.holdout import EVERY, held_out, refuse_rule, split
+from scene.readers.info import CameraInfo, Posed, SceneInfo
 from scene.readers.metashape import read_metashape
 from scene.readers.phone_scans import read_polycam, read_record3d
 from scene.readers.photos import camera_info, finished
@@ -148,12 +149,13 @@ def read_nerfstudio(
     start: StartOptions | None = OWN_POINTS,
     masks: MaskOptions = NO_MASKS,
     native: bool = False,
+    rule: str = EVERY,
 ) -> SceneInfo:
     """Read a nerfstudio or instant-ngp scene (transforms.json), or what stands for it (`camera_file`), views sorted by
     name (bytes).
 
     hold_out: the file's own split if it has one (test_frames, and test_filenames, else val_filenames, are the test
-    views), else every 8th view. Frames may name masks, which --masks replaces. Points come from the file's
+    views), else as `rule` says. Frames may name masks, which --masks replaces. Points come from the file's
     ply_file_path, else from a points3D.ply beside it. Arguments and errors as for `scene.dataset_readers.read_scene`;
     images has an effect for Metashape alone.
     """
@@ -174,7 +176,10 @@ def read_nerfstudio(
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
     _say_if_unused(images, path, cameras)
-    views = _own_split(path, content, cameras, tests, hold_out) or split_by_order(cameras, hold_out, folder)
+    if views := _own_split(path, content, cameras, tests, hold_out):
+        refuse_rule(rule, path)
+    else:
+        views = split(cameras, hold_out, rule, folder)
 
     def own() -> StartCloud | None:
         name = content.get("ply_file_path")

@@ -217,6 +217,26 @@ def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
     return [_panel(folder / f"{scene}_poses.png", scene, False, labels, draw)] if shown else []
 
 
+def draw_cameras(folder: Path, scene: str, splits: Mapping[str, Sequence[Any]]) -> list[Path]:
+    """Draw the cameras of each split from above; return the files.
+
+    splits: by their names, of test and of training cameras arrays (N, 4): two coordinates, and two of the optical axis.
+    """
+    from matplotlib import rc_context
+
+    paths = []
+    for number, (split, both) in enumerate(splits.items(), start=1):
+        with rc_context({"font.size": FONT}):
+            figure, axes = _figure(1, PANEL, f"{scene}: {split}")
+            for (name, color), cameras in reversed([*zip(COLORS.items(), both, strict=True)]):  # test views on top
+                axes.quiver(*cameras.T, color=color, angles="xy", width=0.004, label=f"{len(cameras):,} {name} views")
+            axes.set(aspect="equal", adjustable="datalim", xticks=[], yticks=[])
+            figure.legend(loc="outside lower center", ncols=2, frameon=False)
+            paths.append(folder / f"{scene}_cameras_{number}.png")
+            _save(figure, paths[-1], DPI)
+    return paths
+
+
 def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool, subset: int | None) -> None:
     """Draw a line for each run."""
     configs = list(dict.fromkeys(run["config"] for run in runs))

@@ -14,11 +14,14 @@ from typing import Any
 from urllib.parse import quote
 
 import jinja2
+import numpy as np
 from markupsafe import Markup
 
+from scene.readers.info import from_above, up_of
 from splatting.evaluation import comparison, tables
-from splatting.evaluation.figures import draw_curves, draw_poses
+from splatting.evaluation.figures import draw_cameras, draw_curves, draw_poses
 from splatting.evaluation.gains import gains
+from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.paper import csv_text, tex_text
 from splatting.evaluation.renders import GAIN, ComparedViews
 from splatting.files.image_files import open_image
@@ -39,7 +42,7 @@ _NUMBER = re.compile(r"[\d.,]*\d")
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `curves`, `poses`, `masked`; `views`
+Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `cameras`, `curves`, `poses`, `masked`; `views`
 
 
 def make_report(
@@ -116,6 +119,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
     for scene, members in runs.items():
         peers = [peer for peer in report["peers"] if peer["scene"] == scene]
         pictures[scene] = {
+            "cameras": _figures(draw_cameras, folder, scene, _from_above(output, members)),
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
             "masked": [path for run in members for path in _of_parts(output / run["model"])],
@@ -128,6 +132,22 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
         with atomic_write(output / name) as temporary:
             # Names that are not UTF-8 have surrogates, which appear as numbers.
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def _from_above(output: Path, runs: Sequence[Run]) -> dict[str, list[np.ndarray]]:
+    """Places and axes of the cameras in each split, for `draw_cameras`, of models whose cameras.json has them."""
+    found: dict[str, list[np.ndarray]] = {}
+    for run in runs:
+        cameras, count = json_or_none(output / run["model"] / "cameras.json"), run["views"]["train"]
+        try:
+            places, turns = (np.array([camera[key] for camera in cameras]) for key in ("position", "rotation"))
+            axes = from_above(up_of(turns)).T
+            flat = np.c_[places @ axes, turns[:, :, 2] @ axes]
+        except (KeyError, TypeError, ValueError, IndexError):
+            continue
+        if run["split"] and count is not None:
+            found.setdefault(run["split"], np.split(flat, [len(flat) - count]))
+    return found
 
 
 def _of_parts(model: Path) -> list[Path]:

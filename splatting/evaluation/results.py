@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from arguments import read_model_json
 from scene.readers.info import HOLD
 from splatting.evaluation import model_folder as folder_of
 from splatting.evaluation.comparison import BESIDE, SCORES
@@ -94,21 +95,23 @@ def _views(model: Path, last: int) -> dict[str, Any]:
     """Return what is known of the test views of the last scored iteration.
 
     cameras.json lists all views, test views first, fully masked ones too. worst_views: those of the lowest PSNR, worst
-    first; split: how they were held out, judging by their names, null if that cannot be told; test_sizes: distinct ones
-    [width, height] in pixels, ascending; views: training views and scored test views.
+    first; split: how they were held out, by --holdout or judging by their names, null if that cannot be told;
+    test_sizes: distinct ones [width, height] in pixels, ascending; views: training views and scored test views.
     """
     truth = model / "test" / f"ours_{last}" / "gt"
     held_out, cameras = view_names(truth), folder_of.json_or_none(model / "cameras.json")
     scores = folder_of.load_scores(model, f"ours_{last}")[1]["PSNR"]
     return {
-        "split": _split(cameras, len(held_out)),
+        "split": _split(model, cameras, len(held_out)),
         "test_sizes": [list(size) for size in sorted({image_size(truth / name) for name in held_out})],
         "views": {"test": len(scores), "train": len(cameras) - len(held_out) if isinstance(cameras, list) else None},
         "worst_views": worst_views(model, scores),
     }
 
 
-def _split(cameras: Any, held_out: int) -> str | None:
+def _split(model: Path, cameras: Any, held_out: int) -> str | None:
+    if rule := read_model_json(model).get("holdout"):
+        return f"--holdout {rule}"
     try:
         names = [str(camera["img_name"]) for camera in cameras]
     except (KeyError, TypeError):

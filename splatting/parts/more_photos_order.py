@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from scene.cameras import Camera
+from scene.readers.holdout import EVERY
 from scene.readers.info import HOLD
 from splatting.files.json_files import read_json
 from splatting.host.listing import some
@@ -60,6 +61,11 @@ def _has_moved(view: Any, before: dict, extent: float) -> bool:
 def _refuse_held_out(run: Any, before: dict[str, dict]) -> None:
     """UserError if test views were trained on. With every HOLD-th held out, new names move the count."""
     tests, trains = run.scene.info.test_cameras, run.scene.info.train_cameras
+    if tests and run.options.holdout != EVERY:
+        raise UserError(
+            f"with more photos, --holdout {run.options.holdout} would hold out some that {run.start} was trained on; "
+            "start a new training"
+        )
     if not tests or len(tests) != math.ceil(len([*tests, *trains]) / HOLD):  # the scene says which views test
         return
     held = [view.image_name for view in tests if view.image_name in before]

@@ -17,7 +17,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.density_rules import logit
 from scene.gaussians.start import start_rows
 from scene.point_depths import PointDepths
-from scene.readers.info import CameraInfo, SceneInfo
+from scene.readers.info import CameraInfo, SceneInfo, up_of
 from scene.readers.tracks import projected
 from scene.scene import Scene
 from utils.graphics_utils import BasicPointCloud
@@ -147,7 +147,6 @@ _SMOOTH = 0.04  # standard deviation of a photo over three by three cells, at mo
 _AROUND = 1, 4  # cells around a point that are not the sky's, and that do not tell of one, at least
 _SPACINGS = 1.0, 2.0  # the same in mean distances of a photo's points: by chance 0.01 % of places have none in two
 _BELOW = -0.2  # sine of the elevation: a sky ends below the horizon where the ground ends
-_UNTURNED = 0.05  # weight of the photos' own upward axes where their sideward axes do not tell what is up
 _NEARER = 1.0, 1.5, 2.2, 3.3, 5.0, 7.5  # extents: distances of walls
 _BETTER = 0.5  # mean square of the colours' differences there, as a part of that far away, at most: it is a wall
 _NOISE = 1e-4  # of that mean square: of the photos
@@ -188,7 +187,7 @@ def find_directions(scene: Scene, center: list[float], radius: float) -> tuple[B
     photos = [_photo(camera, info.train_cameras[camera.uid], info.point_cloud.points)
               for camera in sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)]  # fmt: skip
     toward = _directions(info.train_cameras)
-    shell, height = center + radius * toward, toward @ _up(info.train_cameras)
+    shell, height = center + radius * toward, toward @ up_of(np.stack([view.R for view in info.train_cameras]))
     seen = _look(photos, shell)
     alike, several = np.sqrt(seen.squares) < ALIKE, seen.photos > 1
     free = (seen.photos > 0) & (seen.taken[0] == 0) & alike & (height > _BELOW)
@@ -241,14 +240,6 @@ def _directions(views: list[CameraInfo]) -> np.ndarray:
     height, turn = 1 - 2 * place / count, math.pi * (1 + 5**0.5) * place
     across = np.sqrt(1 - height**2)
     return np.stack([across * np.cos(turn), height, across * np.sin(turn)], axis=1)
-
-
-def _up(views: list[CameraInfo]) -> np.ndarray:
-    """What is up (3,): across the photos' sideward axes, which photographers hold level, as far as these differ."""
-    axes = np.stack([view.R for view in views])
-    sideward, upward = axes[:, :, 0], -axes[:, :, 1].mean(0)
-    up = np.linalg.solve(sideward.T @ sideward / len(views) + _UNTURNED * np.eye(3), upward)
-    return up / max(np.linalg.norm(up), 1e-12)
 
 
 def _photo(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:

@@ -14,6 +14,7 @@ import numpy as np
 from PIL import Image, ImageOps
 from tqdm.contrib.concurrent import thread_map
 
+from scene.readers.info import from_above
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
@@ -127,20 +128,11 @@ def _embedded(image: Image.Image, kind: str, **options: Any) -> str:
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def from_above(directions: np.ndarray) -> np.ndarray:
-    """Axes (2, 3) of the picture: across the mean of the cameras' up directions (N, 3)."""
-    up = directions.mean(0)
-    up /= max(float(np.linalg.norm(up)), 1e-9)
-    first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
-    first /= max(float(np.linalg.norm(first)), 1e-9)
-    return np.stack([first, np.cross(up, first)])
-
-
 def _from_above(survey: _Data) -> dict[str, Any]:
     """The picture from above: its size, the points as a PNG, and of each camera by name x, y, degrees and length."""
     photos = survey["photos"]
     places, views, ups = (np.array([photo[key] for photo in photos.values()]) for key in ("place", "view", "up"))
-    axes = from_above(ups) * [[1], [-1]]  # y of a picture goes down
+    axes = from_above(ups.mean(0)) * [[1], [-1]]  # y of a picture goes down
     points, colors = np.array(survey["points"]).reshape(-1, 3), np.array(survey["colors"], np.uint8).reshape(-1, 3)
     flat, seen, along = places @ axes.T, points @ axes.T, views @ axes.T
     # Without the farthest points, which would leave the cameras a spot.

@@ -206,6 +206,11 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
             f"{checkpoint} was trained on all photos, so --eval has no unseen photos to hold out; leave --eval out, or "
             "start a new training"
         )
+    if "holdout" in changed and now.eval:
+        raise UserError(
+            f"{checkpoint} was trained with {_typed('holdout', then['holdout'])}, so it has seen photos that "
+            f"{_typed('holdout', now.holdout)} holds out; give the former, or start a new training"
+        )
     if changed:
         before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
         mixed = VIEW_OPTIONS.intersection(changed) and (folder / CURVE).exists()

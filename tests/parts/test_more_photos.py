@@ -128,6 +128,8 @@ def test_what_cannot_be_continued_is_refused(scenes, first, tmp_path):
         "is of another scene": (other, out, start),
         "--eval would hold out photos that .* was trained on":
             (whole, out, ("--eval", "--iterations", 40, "--start_checkpoint", tmp_path / "first/chkpnt20.pth")),
+        "with more photos, --holdout block would hold out some that .* was trained on; start a new training":
+            (whole, out, ("--eval", "--holdout", "block", "--start_checkpoint", tmp_path / "first/chkpnt20.pth")),
     }  # fmt: skip
     for said, (scene, folder, words) in cases.items():
         with pytest.raises(UserError, match=said):
