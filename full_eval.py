@@ -90,6 +90,7 @@ def _parser() -> OptionParser:
         "again (default: none)")  # fmt: skip
     add("--weights", type=Path, metavar="FOLDER",
         help="folder of the weights of LPIPS and DISTS, as for metrics.py (default: none, and no DISTS)")  # fmt: skip
+    add("--stlpips", **flag, help="also score ST-LPIPS, as metrics.py does with --stlpips")
     add("--html_models", **flag,
         help="write each model into models/ beside the report, as one HTML file with a viewer")  # fmt: skip
     for name, (_, text) in _SHORT_FOR.items():
@@ -127,6 +128,10 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
         from utils.lpips_utils import weights_file  # here, as it imports torchvision
 
         weights_file("vgg", args.weights)
+    if args.stlpips and not args.skip_metrics:
+        from utils.lpips_utils import import_stlpips  # as above
+
+        import_stlpips()
     parse = None if args.skip_training else _parse_for_training
     check_options(more, "after --", parse)
     configs = read_configs(args.configs, parse) if args.configs else {}
@@ -183,7 +188,7 @@ def _carry_out(
             if not args.skip_rendering:
                 stages.render(run, options, child)
             if not args.skip_metrics:
-                download = stages.score(run, child, download, args.weights)
+                download = stages.score(run, child, download, args.weights, args.stlpips)
             if args.html_models:
                 stages.page(run, args.output_path.resolve(), options, child)
             end = f"finished in {time.perf_counter() - begun:.0f} s"

@@ -1,6 +1,6 @@
-"""Score rendered test views against their ground truth: PSNR, SSIM, LPIPS and DISTS.
+"""Score rendered test views against their ground truth: PSNR, SSIM, LPIPS, DISTS and ST-LPIPS.
 
-python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--weights FOLDER]
+python metrics.py -m MODEL [MODEL ...] [--lpips_net vgg|alex|both] [--weights FOLDER] [--stlpips]
 
 Reads MODEL/test/<method>/{renders,gt}, masks if there are any, and the errors of depth that render.py --depth writes.
 Writes MODEL/results.json (means), per_view.json, and metrics_info.json, which states the convention of each number.
@@ -28,7 +28,7 @@ from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.renders import DEPTHS, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
 from splatting.files.json_files import read_json, write_json
 from splatting.host.progress import Bar
-from utils.lpips_utils import MIN_SIDE, NETS, LpipsUnavailable, load_dists, load_network
+from utils.lpips_utils import MIN_SIDE, NETS, LpipsUnavailable, load_dists, load_network, load_stlpips
 from utils.system_utils import UserError, compute_device, run_cli
 
 CONVENTIONS = {
@@ -39,6 +39,7 @@ CONVENTIONS = {
     "LPIPS_vgg": "version 0.1, VGG-16, inputs mapped to [-1,1]",
     "LPIPS_alex": "version 0.1, AlexNet, inputs mapped to [-1,1]",
     "DISTS": "package DISTS-pytorch 0.1, VGG-16, inputs in [0,1] at their own size",
+    "STLPIPS": "package stlpips-pytorch 0.0.2, shift-tolerant AlexNet, inputs mapped to [-1,1]",
     "PSNR_UNFITTED": "the PSNR of the same right halves in the views whose appearance is not fitted",
     "DEPTH": "relative error of the inverse depth at held-out points that the photo has seen: the median of a view",
     "DEPTH_95": "the same: what 95 % of a view's points are below",
@@ -51,7 +52,8 @@ MASKED = {
     "LPIPS": "other pixels of the render are the ground truth's; the mean of the map over the pixels that count",
     "DISTS": "other pixels of the render are the ground truth's",
 }
-NETWORKS = ("LPIPS", "DISTS")  # what the names of their scores begin with
+MASKED["STLPIPS"] = MASKED["LPIPS"]
+NETWORKS = ("LPIPS", "DISTS", "STLPIPS")  # what the names of their scores begin with
 _SAME = 1e-9  # of SSIM, whose sum may differ in its last bits
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float | None]
 Scores = dict[str, dict[str, float | None]]
@@ -146,7 +148,7 @@ def ssim(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) 
 
 
 def _lpips_metric(network: torch.nn.Module, unit_range: bool, device: torch.device) -> Metric:
-    """Return LPIPS by a network of `load_network`, whose normalisation expects [-1, 1].
+    """Return LPIPS by a network of `load_network` or `load_stlpips`, whose normalisation expects [-1, 1].
 
     unit_range: True passes [0, 1] nevertheless, as for the published 3DGS numbers; False maps to [-1, 1] first, as the
     package documents.
@@ -174,16 +176,22 @@ def _tensors(
     return [torch.from_numpy(image.transpose(2, 0, 1)[None].copy()).to(device) / 255 for image in both]
 
 
-def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int) -> dict[str, Metric]:
+def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int, stlpips: bool = False) -> dict[str, Metric]:
     """Make the metrics by key, in the order of the files.
 
     weights: folder of the networks' weights, where a missing or wrong one is a UserError. smallest_side: smallest side
     of all images, in pixels. If a backbone or its weights are missing, a line says so and its metrics return None.
+    stlpips: with ST-LPIPS, a UserError without its package.
     """
     keys = ["SSIM", "PSNR", "LPIPS"] + [f"LPIPS_{net}" for net in ("vgg", "alex") if lpips_net in (net, "both")]
     metrics: dict[str, Metric] = dict.fromkeys(keys, lambda render, truth, mask: None)
     metrics.update(SSIM=ssim, PSNR=psnr)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if stlpips:
+        if smallest_side < MIN_SIDE["stlpips"]:
+            least = MIN_SIDE["stlpips"]
+            raise UserError(f"ST-LPIPS needs images with sides of at least {least} pixels; leave --stlpips out")
+        metrics["STLPIPS"] = _lpips_metric(load_stlpips(device), False, device)
     for net in ("vgg", "alex"):
         if lpips_net not in (net, "both"):
             continue
@@ -257,12 +265,13 @@ def evaluate(
     lpips_net: str = "vgg",
     weights: str | Path | None = None,
     error_maps: bool = False,
+    stlpips: bool = False,
 ) -> None:
     """Score model folders, print the means and write the files of scores, as the command does.
 
     lpips_net: "vgg", "alex" or "both". weights: folder of torchvision's files of vgg16 and alexnet, instead of torch's
-    cache and a download. error_maps: write `test/METHOD/errors`, too. UserError if a folder cannot be scored, after the
-    others were.
+    cache and a download. error_maps: write `test/METHOD/errors`, too. stlpips: score ST-LPIPS, too. UserError if a
+    folder cannot be scored, after the others were.
     """
     found, failed = {}, []
     for model in map(Path, model_paths):
@@ -273,7 +282,7 @@ def evaluate(
     if not found:
         raise UserError("; ".join(failed))
     sides = [side for methods in found.values() for pairs in methods.values() for pair in pairs for side in pair.size]
-    metrics = make_metrics(lpips_net, weights and Path(weights), min(sides))
+    metrics = make_metrics(lpips_net, weights and Path(weights), min(sides), stlpips)
     for model, methods in found.items():
         _score_model(model, methods, metrics, error_maps)
     if failed:
@@ -288,7 +297,7 @@ def depth_scores(method: Path) -> Scores:
 
 
 def keep_networks(model: Path, method: str, scores: Scores) -> list[str]:
-    """Add the LPIPS and DISTS that model/per_view.json has of a method to new scores that lack them; return which.
+    """Add those of NETWORKS that model/per_view.json has of a method to new scores that lack them; return which.
 
     None are added unless every view has the same PSNR and SSIM as then, which other pictures would change.
     """
@@ -346,7 +355,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
 
 
 def main() -> None:
-    parser = OptionParser(description="Score rendered test views: PSNR, SSIM, LPIPS, DISTS.")
+    parser = OptionParser(description="Score rendered test views: PSNR, SSIM, LPIPS, DISTS, ST-LPIPS.")
     add = parser.add_argument
     add("-m", "--model_paths", type=Path, nargs="+", required=True,
         help="model folders to score (default: none, must be given)")  # fmt: skip
@@ -356,10 +365,13 @@ def main() -> None:
     add("--weights", type=Path, metavar="FOLDER",
         help="folder of torchvision's files vgg16-397923af.pth, for LPIPS and DISTS, and alexnet-owt-7be5be79.pth; "
         "nothing is downloaded then (default: torch's cache, or else a download into it, and no DISTS)")  # fmt: skip
+    add("--stlpips", action="store_true",
+        help="also score ST-LPIPS, whose weights come with the package stlpips-pytorch (`pip install '.[stlpips]'`; in "
+        "part not for commercial use) (default: off)")  # fmt: skip
     add("--error_maps", action="store_true",
         help="also write error maps into test/METHOD/errors (default: off)")  # fmt: skip
     args = parser.parse_args()
-    evaluate(args.model_paths, args.lpips_net, args.weights, args.error_maps)
+    evaluate(args.model_paths, args.lpips_net, args.weights, args.error_maps, args.stlpips)
 
 
 if __name__ == "__main__":

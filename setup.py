@@ -57,6 +57,7 @@ setup(
             "zstandard==0.25.0",
         ],
         "heic": ["pillow-heif==1.8.1"],  # photos of convert.py
+        "stlpips": ["stlpips-pytorch==0.0.2"],  # metrics.py --stlpips; in part CC BY-NC-SA 4.0
         "video": ["imageio-ffmpeg==0.8.1"],  # convert.py --video, render.py --path
         "viewer": ["viser==1.1.1"],  # view.py, train.py --viewer
     },

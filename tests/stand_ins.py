@@ -124,13 +124,14 @@ def render(words: list[str], _: dict[str, str]) -> None:
 
 def metrics(words: list[str], environment: dict[str, str]) -> None:
     """The PSNR that `train` left, and less for the second view."""
-    args = _parsed(words, weights=None, error_maps=False)
+    args = _parsed(words, weights=None, error_maps=False, stlpips=False)
     with (args.m / "scored.txt").open("a") as calls:
         calls.write(json.dumps([environment.get("GS_DOWNLOAD"), *words]) + "\n")
     psnr = json.loads((args.m / "stand_in.json").read_text())["psnr"]
     means, per_view = {}, {}
     for folder in (args.m / "test").iterdir():
         means[folder.name] = {"SSIM": 0.9, "PSNR": psnr, "LPIPS": None} | ({"DISTS": 0.125} if args.weights else {})
+        means[folder.name] |= {"STLPIPS": 0.25} if args.stlpips else {}
         per_view[folder.name] = {"PSNR": {"00000.png": psnr + 1, "00001.png": psnr - 1}}
     for name in ("00000.jpg", "00001.jpg") if args.error_maps else ():
         (folder / "errors").mkdir(exist_ok=True)

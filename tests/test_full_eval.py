@@ -121,7 +121,7 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     assert 0 < first["cpu_seconds"] < 30 and "| process (s) | CPU (s) |" in evaluate.text("md")
     assert first["finished"] and first["failure"] is None and first["model"] == "attic"
     assert first["iterations"]["40"] == {
-        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "DISTS": None, "fps": 250.0, "gaussians": 16000,
+        "PSNR": 23.0, "SSIM": 0.9, "LPIPS": None, "DISTS": None, "STLPIPS": None, "fps": 250.0, "gaussians": 16000,
         "gaussians_saved": 16000, "joules": None, "peak_memory_mib": 340.0, "ply_mb": 36e-6, "render_ms": 4.0,
         "seconds": 16.0, "views": 2, "PSNR_given_poses": None, "PSNR_fitted_appearance": None,
     }  # fmt: skip
@@ -192,6 +192,17 @@ def test_weights_are_checked_first_and_give_dists(evaluate, tmp_path, monkeypatc
     assert evaluate.calls() == done and " DISTS |" in evaluate.text("md")
     scorings = (evaluate.out / "attic" / "scored.txt").read_text().splitlines()
     assert len(scorings) == 2 and json.loads(scorings[1])[-1] == f"--weights={tmp_path}"
+
+
+def test_stlpips_is_scored_where_it_was_not(evaluate, monkeypatch):
+    evaluate("attic")
+    checked = []
+    monkeypatch.setattr(lpips_utils, "import_stlpips", lambda: checked.append(1))
+    for more in (["--stlpips"], []):
+        assert evaluate("attic", *more)["summary"][0]["STLPIPS"]["mean"] == 0.25
+    assert checked == [1] and " ST-LPIPS |" in evaluate.text("md")
+    scorings = (evaluate.out / "attic" / "scored.txt").read_text().splitlines()
+    assert len(scorings) == 2 and json.loads(scorings[1])[-1] == "--stlpips"
 
 
 def test_other_options_are_not_mixed_in(evaluate):

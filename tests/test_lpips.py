@@ -1,4 +1,4 @@
-"""LPIPS and DISTS: the values of their packages, where weights come from, and errors."""
+"""LPIPS, DISTS and ST-LPIPS: the values of their packages, where weights come from, and errors."""
 
 import hashlib
 import importlib
@@ -210,3 +210,24 @@ def test_dists_is_the_packages(judges, tmp_path, monkeypatch, capsys):
     assert "DISTS" not in metrics.make_metrics("vgg", folder, 40)
     said = capsys.readouterr().out
     assert said.count("DISTS is left out: ") == 2 and f"{tmp_path} has no file {judges.files['vgg'].name}, the" in said
+
+
+def test_stlpips_is_the_packages(monkeypatch):
+    pytest.importorskip("stlpips_pytorch")
+    judge = lpips_utils.import_stlpips().LPIPS(net="alex", variant="shift_tolerant", verbose=False)  # its own loading
+    assert not hasattr(sys.modules.get("torchsummary"), "embed")  # what stood for it is gone
+    x, y = images()
+    ours = metrics.make_metrics("alex", None, 40, stlpips=True)["STLPIPS"]
+    assert ours(*map(pixels, (x, y)), None) == judge(2 * x - 1, 2 * y - 1).item() > 0.01
+    mask = np.zeros((48, 40), bool)
+    mask[10:40, 5:30] = True
+    judge.spatial = True
+    expected = judge(2 * torch.where(torch.from_numpy(mask), x, y) - 1, 2 * y - 1)[0, 0][torch.from_numpy(mask)].mean()
+    assert ours(*map(pixels, (x, y)), mask) == expected.item()
+    smallest = pixels(x)[:21, :21]
+    assert ours(smallest, smallest, None) == 0
+    with pytest.raises(UserError, match="ST-LPIPS needs images with sides of at least 21 pixels; leave --stlpips out"):
+        metrics.make_metrics("alex", None, 20, stlpips=True)
+    monkeypatch.setattr(lpips_utils, "_OF_STLPIPS", "0" * 64)
+    with pytest.raises(UserError, match="alex_shift_tolerant.pth is damaged: .*; install stlpips-pytorch again"):
+        lpips_utils.load_stlpips(CPU)

@@ -213,6 +213,21 @@ def test_without_weights_or_package_lpips_is_null_and_says_what_to_do(tmp_path, 
     assert status == 0 and out.count("import of lpips halted; None in sys.modules; run pip install") == 3  # and DISTS
 
 
+def test_stlpips_is_kept_and_without_its_package_refused(model, run, lpips, monkeypatch):
+    monkeypatch.setitem(sys.modules, "stlpips_pytorch.stlpips", None)
+    status, _, err = run("-m", model, "--stlpips", *lpips)
+    assert status == 2 and err.startswith("error: ST-LPIPS needs the package stlpips-pytorch (")
+    assert not (model / "results.json").exists()
+    assert err.endswith("); `pip install '.[stlpips]'`\n")
+
+    monkeypatch.setattr(metrics, "load_stlpips", lambda _: lambda x, y, normalize: 2 * normalize)
+    assert run("-m", model, "--stlpips", *lpips)[0] == 0
+    results, _, info = files_of(model)
+    assert results["ours_30"]["STLPIPS"] == 2.0 and "stlpips-pytorch" in info["conventions"]["STLPIPS"]
+    assert "kept STLPIPS of an earlier" in run("-m", model, *lpips)[1]
+    assert files_of(model)[0] == results
+
+
 def emptied(model: Path, *folders: str) -> None:
     for file in model.glob("test/*/*/*.png"):
         file.unlink()

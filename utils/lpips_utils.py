@@ -1,7 +1,8 @@
-"""LPIPS (Zhang et al. 2018, version 0.1) and DISTS (Ding et al. 2020) through the packages `lpips` and `DISTS-pytorch`.
+"""LPIPS (Zhang et al. 2018, version 0.1), DISTS (Ding et al. 2020) and ST-LPIPS (Ghildyal and Liu 2022).
 
-The packages bring the weights of features; those of the networks are torchvision's for ImageNet. They come from a given
-folder, or for LPIPS from torch's cache or a download into it. A network without weights is never used.
+The packages `lpips` and `DISTS-pytorch` bring the weights of features; those of the networks are torchvision's for
+ImageNet. They come from a given folder, or for LPIPS from torch's cache or a download into it. A network without
+weights is never used. `stlpips-pytorch` brings all weights.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from unittest import mock
 
 import torch
@@ -27,8 +28,9 @@ from splatting.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them
-MIN_SIDE = {"vgg": 16, "alex": 31}  # pixels; smaller images shrink to nothing in pooling
+MIN_SIDE = {"vgg": 16, "alex": 31, "stlpips": 21}  # pixels; smaller images shrink to nothing in pooling
 _OF_DISTS = "f5e65c96230b7f6ca995691647d482237e4cab8a50c5c4a5784f219ef0748218"  # SHA-256 of its package's weights.pt
+_OF_STLPIPS = "b356b382f96010f77d085ee8343ecd9fd322d0a56e8de2b2d0549fafcad8b9ee"  # of its shift-tolerant AlexNet
 _DOWNLOAD_TIMEOUT = 10.0  # seconds without an answer before the network counts as absent
 
 TOLD = "told"  # GS_DOWNLOAD where an earlier command has said what to do
@@ -39,11 +41,19 @@ class LpipsUnavailable(Exception):
 
 
 def import_lpips() -> ModuleType:
-    """Import the `lpips` package, also if torch is CPU-only.
+    """Import the `lpips` package, also if torch is CPU-only. Raises LpipsUnavailable without it."""
+    try:
+        return _import_with_torchvision("lpips")
+    except ImportError as error:
+        raise LpipsUnavailable(f"{error}; run pip install -r requirements.txt") from error
+
+
+def _import_with_torchvision(name: str) -> ModuleType:
+    """Import a module that imports torchvision, also if torch is CPU-only.
 
     There torchvision's wheel cannot load its compiled operators, and its Python side (0.28) fails when it attaches fake
-    kernels to two of them. LPIPS needs neither, so this declares their schemas and repeats the import. It does so only
-    after the failure, because the real operators' schemas would clash with these. Raises LpipsUnavailable without it.
+    kernels to two of them. The metrics need neither, so this declares their schemas and repeats the import. It does so
+    only after the failure, because the real operators' schemas would clash with these.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -52,13 +62,10 @@ def import_lpips() -> ModuleType:
         except RuntimeError as error:
             if "torchvision::" not in str(error):
                 raise
-            for name in [name for name in sys.modules if name.split(".")[0] == "torchvision"]:
-                del sys.modules[name]
+            for broken in [module for module in sys.modules if module.split(".")[0] == "torchvision"]:
+                del sys.modules[broken]
             _declare_missing_operators()
-        try:
-            return importlib.import_module("lpips")
-        except ImportError as error:
-            raise LpipsUnavailable(f"{error}; run pip install -r requirements.txt") from error
+        return importlib.import_module(name)
 
 
 def _declare_missing_operators() -> None:
@@ -99,6 +106,33 @@ def load_dists(folder: Path, device: torch.device) -> nn.Module:
     _fill(model, _load_state(weights_file("vgg", folder)), "vgg")
     file = _checked(Path(package.__file__).with_name("weights.pt"), _OF_DISTS, "install DISTS-pytorch again")
     model.load_state_dict(_load_state(file), strict=False)
+    return model.to(device).eval().requires_grad_(False)
+
+
+def import_stlpips() -> ModuleType:
+    """Import the module of the package stlpips-pytorch that has its network. UserError without the package.
+
+    It imports two packages that it neither lists nor needs here, so others stand for them.
+    """
+    unneeded = {"IPython", "torchsummary"} - sys.modules.keys()
+    sys.modules.update(dict.fromkeys(unneeded, SimpleNamespace(embed=None, summary=None)))
+    try:
+        return _import_with_torchvision("stlpips_pytorch.stlpips")
+    except ImportError as error:
+        said = f"ST-LPIPS needs the package stlpips-pytorch ({error}); `pip install '.[stlpips]'`"
+        raise UserError(said) from error
+    finally:
+        for name in unneeded:
+            del sys.modules[name]
+
+
+def load_stlpips(device: torch.device) -> nn.Module:
+    """Load ST-LPIPS, whose arguments are those of LPIPS, by the package's default network. Nothing is downloaded."""
+    package = import_stlpips()
+    model = package.LPIPS(pretrained=False, net="alex", variant="shift_tolerant", verbose=False)
+    file = Path(package.__file__).with_name("weights") / "vST0.0" / "alex_shift_tolerant.pth"
+    state = _load_state(_checked(file, _OF_STLPIPS, "install stlpips-pytorch again"))
+    model.load_state_dict(state, strict=False)  # which names the last layers once, and the model twice
     return model.to(device).eval().requires_grad_(False)
 
 

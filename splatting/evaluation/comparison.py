@@ -19,7 +19,7 @@ from splatting.files.json_files import read_json
 GIVEN_POSES = "given_poses"  # behind the name of renders and scores with the dataset's poses, where others were trained
 FITTED = "fitted_appearance"  # the same of right halves, with the photos' appearance fitted to left ones
 BESIDE = (GIVEN_POSES, FITTED)
-SCORES = ("PSNR", "SSIM", "LPIPS", "DISTS")
+SCORES = ("PSNR", "SSIM", "LPIPS", "DISTS", "STLPIPS")
 OTHER_SCORES = tuple(f"PSNR_{name}" for name in BESIDE)
 QUANTITIES = (
     *(*SCORES, "seconds", "joules", "process_seconds", "cpu_seconds", "gaussians", "gaussians_saved"),

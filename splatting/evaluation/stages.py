@@ -184,8 +184,8 @@ def _rendered(model: Path, iteration: int) -> dict[str, int] | None:
     return {"views": len(renders)} if renders and renders == truth else None
 
 
-def score(run: Run, child: Child, download: bool = True, weights: Path | None = None) -> bool:
-    """Run metrics.py, unless the same renders are already scored, with the same folder of weights.
+def score(run: Run, child: Child, download: bool = True, weights: Path | None = None, stlpips: bool = False) -> bool:
+    """Run metrics.py, unless the same renders are already scored, with the same folder of weights and ST-LPIPS or not.
 
     download: whether it may try to download the weights of LPIPS; return whether another run may. A try without an
     answer takes 10 seconds.
@@ -201,7 +201,8 @@ def score(run: Run, child: Child, download: bool = True, weights: Path | None = 
     before = record.stage("metrics")
     environment = {} if download else {"GS_DOWNLOAD": TOLD}
     given = {} if weights is None else {"weights": str(weights.resolve())}
-    words = [f"--{name}={folder}" for name, folder in given.items()]
+    words = [f"--{name}={folder}" for name, folder in given.items()] + ["--stlpips"] * stlpips
+    given |= {"stlpips": True} if stlpips else {}
     command = _script("metrics.py", "-m", str(model), "--error_maps", *words)
     _once(
         child, record, "metrics", "scoring", command, {"renders": renders, **given}, dict,

@@ -9,6 +9,7 @@ from splatting.evaluation.comparison import COMPARED, OTHER_SCORES, SCORES
 
 QUANTITIES = {  # heading and digits
     **{"PSNR": ("PSNR (dB)", 2), "SSIM": ("SSIM", 4), "LPIPS": ("LPIPS", 4), "DISTS": ("DISTS", 4)},
+    "STLPIPS": ("ST-LPIPS", 4),
     **{
         "seconds": ("training (s)", 1),
         "joules": ("GPU energy (J)", 0),
