@@ -53,6 +53,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     step = _step(raw, guard)
     return {
         "project": (ops.project, [*scene]),
+        "project_binned": (ops.project_binned, [*scene, True]),
         "bin": (ops.bin, [splats, depths, rects, counts, height, width, True]),
         "blend": (ops.blend, [splats, instances, ranges, background, height, width, True, True]),
         "list_records": (ops.list_records, reach),

@@ -80,11 +80,12 @@ def rasterize_channels(
     stops = most_alpha is not None
     how = Blending(scene.size, most_alpha if stops else _MOST_ALPHA, stops, colored, want_absolute_gradient)
     shared, camera = Shared(), camera_numbers(scene, settings)
-    splats, own_depths, rects, tile_counts, radii = projected(shared, camera, means2d, *scene)
-    order = own_depths.detach() if depths is None else depths
-    lists = order, rects, tile_counts, None
+    train = needs_function(*gaussians, means2d, features, background, camera)
+    splats, own_depths, tile_counts, radii, *lists = projected(
+        shared, train if depths is None else None, camera, means2d, *scene
+    )
+    lists = own_depths.detach() if depths is None else depths, lists, tile_counts, None
     own = None if colored and not features.shape[1] else features
-    train = splats.requires_grad or needs_function(features, background)
     image, transmittance, *_ = blended(shared, how, train, *lists, splats, None, None, None, None, own, background)
     return ChannelImage(image, transmittance, radii, splats.detach(), own_depths.detach(), tile_counts)
 

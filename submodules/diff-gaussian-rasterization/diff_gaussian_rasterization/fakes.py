@@ -59,6 +59,14 @@ def _(means, *arguments):
     return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints
 
 
+@_fake("project_binned")
+def _(means, *arguments):
+    count, (height, width, *_), train = means.shape[0], arguments[11], arguments[12]
+    ints = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
+    lists = _binned(means, count, height, width, train)
+    return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints, *lists
+
+
 @_fake("bin")
 def _(splats, depths, rects, tile_counts, height, width, train):
     return _binned(splats, splats.shape[0], height, width, train)

@@ -48,8 +48,9 @@ class _Projection(NamedTuple):
     splats: Tensor
     colored: bool  # whether they have colours
     features: Tensor | None  # (N, F): colours that they do not have, then signals
+    train: bool  # whether a backward may follow
     order: Tensor  # (N,) depths
-    rects: Tensor
+    lists: list[Tensor]  # of tiles, or what they are made of
     tile_counts: Tensor
     notes: tuple[Tensor, ...]  # of `described`, without the rows
     rows: Tensor | None  # that are shown, if they are packed
@@ -187,15 +188,18 @@ def _project(call: Call, item: Item) -> _Projection:
     )  # fmt: skip
     numbers = _numbers(view, bool(degree), len(lens) > 3) if needs_function(view) else None
     shared = Shared()
-    splats, own, rects, counts, _ = projected(shared, numbers, None, *scene)
+    train = needs_function(*item)
+    how = shared, train if depth is None else None, numbers, None
+    splats, own, counts, _, *lists = projected(*how, *scene)
     if call.clip > 0:
         radii = OPERATORS.describe(splats.detach(), own.detach(), counts)[0]
         opacities = torch.where((radii <= call.clip).all(1), 0, opacities)
-        splats, own, rects, counts, _ = projected(shared, numbers, None, item.means, opacities, *scene[2:])
+        splats, own, counts, _, *lists = projected(*how, item.means, opacities, *scene[2:])
     depth = own if depth is None else depth
     *notes, rows = described(shared, call.packed, splats, depth, counts)
     shown = torch.cat(features, 1) if len(features) > 1 else features[0] if features else None
-    return _Projection(shared, splats, degree is not None, shown, depth.detach(), rects, counts, tuple(notes), rows)
+    colored, order = degree is not None, depth.detach()
+    return _Projection(shared, splats, colored, shown, train, order, lists, counts, tuple(notes), rows)
 
 
 def _lens(call: Call, K: Tensor) -> tuple[float, ...]:
@@ -269,8 +273,8 @@ def _blend(
     image, alpha, *lists = blended(
         of.shared,
         Blending(call.size, _MOST_ALPHA, True, of.colored, call.absgrad, True),
-        of.splats.requires_grad or needs_function(of.features, behind),
-        *(of.order, of.rects, of.tile_counts, of.rows, of.splats),
+        of.train,
+        *(of.order, of.lists, of.tile_counts, of.rows, of.splats),
         *(means2d, conics, opacities, depths if call.deep else None, of.features, behind),
     )
     if call.mean_depth:

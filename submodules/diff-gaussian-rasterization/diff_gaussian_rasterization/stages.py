@@ -55,15 +55,24 @@ class Shared:
 
 
 class _Projected(Function):
-    """Inputs: `Shared`, the camera's numbers, means2d, `Scene`'s. Results: those of the operator `project`."""
+    """Inputs: `Shared`, whether a backward follows, or None for no lists, the camera's numbers, means2d, `Scene`'s.
+
+    Results: splats, depths, tile_counts, radii, then the lists of the operator `bin`, or the rects that it takes.
+    """
 
     @staticmethod
-    def forward(ctx: Any, shared: Shared, camera: Tensor | None, means2d: Tensor | None, *scene: Any) -> tuple:
+    def forward(
+        ctx: Any, shared: Shared, train: bool | None, camera: Tensor | None, means2d: Tensor | None, *scene: Any
+    ) -> tuple:
         with torch._C._AutoDispatchBelowAutograd():
-            splats, depths, *others = OPERATORS.project(*scene)
+            if train is None:
+                splats, depths, rects, *counts = OPERATORS.project(*scene)
+                others = *counts, rects
+            else:
+                splats, depths, *others = OPERATORS.project_binned(*scene, train)
         ctx.shared, ctx.numbers = shared, scene[_TENSORS:]
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*scene[:_TENSORS], splats, others[1])
+        ctx.save_for_backward(*scene[:_TENSORS], splats, others[0])
         ctx.mark_non_differentiable(*others)
         return splats, depths, *others
 
@@ -75,19 +84,19 @@ class _Projected(Function):
         splats, tile_counts = saved[_TENSORS:]
         source = splats, tile_counts, torch.zeros_like(splats) if moments is None else moments
         means, to_view = scene[0], scene[8].to(splats)[:3, 2]
-        if needed[1]:
-            results[1] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, source))
+        if needed[2]:
+            results[2] = OPERATORS.sum_blocks(OPERATORS.camera_vjp(*scene, source))
             if of_depth is not None:
-                results[1][_ROW_Z] += of_depth @ means
-                results[1][_SHIFT_Z] += of_depth.sum()
-        wanted = needed[2 : 3 + 8]
+                results[2][_ROW_Z] += of_depth @ means
+                results[2][_SHIFT_Z] += of_depth.sum()
+        wanted = needed[3 : 4 + 8]
         if any(wanted):
             found = OPERATORS.rasterize_vjp(*scene, wanted, source)
-            results[2 : 3 + 8] = [gradient if want else None for gradient, want in zip(found, wanted, strict=True)]
+            results[3 : 4 + 8] = [gradient if want else None for gradient, want in zip(found, wanted, strict=True)]
             if wanted[0] and ctx.shared.lengths is not None:
-                results[2][:, 2] = ctx.shared.lengths
+                results[3][:, 2] = ctx.shared.lengths
             if wanted[1] and of_depth is not None:
-                results[3].addr_(of_depth, to_view)
+                results[4].addr_(of_depth, to_view)
         return tuple(results)
 
 
@@ -161,20 +170,21 @@ def _moments(splats: Tensor, tile_counts: Tensor, centers: Tensor, conics: Tenso
 
 
 class _Blended(Function):
-    """Inputs: `Shared`, `Blending`, whether a backward follows, order (N,), rects, tile_counts, rows that are shown or
-    None, splats, then means2d, conics, opacities and depths as described, or None, features (N, F) or None, and the
-    background. Channels: colours, features, then depths, if they are described; they are blended as `order` has them.
-    Results: image and transmittance or alpha, and the lists: instances and ranges.
+    """Inputs: `Shared`, `Blending`, whether a backward follows, order (N,), the lists or rects, tile_counts, rows that
+    are shown or None, splats, then means2d, conics, opacities and depths as described, or None, features (N, F) or
+    None, and the background. Channels: colours, features, then depths, if they are described; they are blended as
+    `order` has them. Results: image and transmittance or alpha, and the lists: instances and ranges.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, shared: Shared, how: Blending, train: bool, order: Tensor, rects: Tensor, tile_counts: Tensor,
-        rows: Tensor | None, splats: Tensor, means2d: Tensor | None, conics: Tensor | None, opacities: Tensor | None,
-        depths: Tensor | None, features: Tensor | None, background: Tensor,
+        ctx: Any, shared: Shared, how: Blending, train: bool, order: Tensor, lists: Sequence[Tensor],
+        tile_counts: Tensor, rows: Tensor | None, splats: Tensor, means2d: Tensor | None, conics: Tensor | None,
+        opacities: Tensor | None, depths: Tensor | None, features: Tensor | None, background: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
         with torch._C._AutoDispatchBelowAutograd():
-            lists = OPERATORS.bin(splats, order, rects, tile_counts, *how.size, train)
+            if len(lists) == 1:
+                lists = OPERATORS.bin(splats, order, *lists, tile_counts, *how.size, train)
             parts = [splats[:, 6:9]] if how.colored else []
             parts += [part for part in (features, None if depths is None else order[:, None]) if part is not None]
             values = parts[0] if len(parts) == 1 else torch.cat(parts, 1)
