@@ -16,8 +16,9 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
+NAMES = ("README", "CONTRIBUTING", "CHANGELOG", "SECURITY", "paper", "benchmarks/README")
 PAGES = [
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "benchmarks/README.md")),
+    *(ROOT / f"{name}.md" for name in NAMES),
     *sorted((ROOT / "docs").rglob("*.md")),
 ]
 FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -133,17 +134,24 @@ def test_links_resolve_in_the_repository():
     assert links and [(_name(page), link) for page, link in links if not (page.parent / link).exists()] == []
 
 
-def test_figures_of_the_readme_stand_in_the_results():
-    """README copies rows of a table, without their spread. A table made anew must not leave the copy behind."""
+@pytest.mark.parametrize("page", ["README.md", "paper.md"])
+def test_copied_figures_stand_in_the_results(page):
+    """The pages copy rows of a table, without their spread. A table made anew must not leave the copy behind."""
 
-    def rows(page: str) -> list[list[str]]:
-        lines = (ROOT / page).read_text(encoding="utf-8").splitlines()
+    def rows(name: str) -> list[list[str]]:
+        lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
         cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
         return [[cell.partition(" ±")[0] for cell in row] for row in cells]
 
-    copied = [row for row in rows("README.md") if re.fullmatch(r"[\d.]+", row[-2])]
+    copied = [row for row in rows(page) if re.fullmatch(r"[\d.]+", row[-2])]
     measured = rows("docs/results/training.md")
     assert len(copied) == 6 and all(any(set(row) <= set(one) for one in measured) for row in copied)
+
+
+def test_the_paper_cites_what_its_bibliography_has():
+    known = re.findall(r"^@\w+\{(\w+),", (ROOT / "paper.bib").read_text(encoding="utf-8"), re.MULTILINE)
+    cited = re.findall(r"@(\w+)", (ROOT / "paper.md").read_text(encoding="utf-8"))
+    assert set(known) == set(cited) and len(known) == len(set(known))
 
 
 def test_the_worked_example_applies_to_the_code():
