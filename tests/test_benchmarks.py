@@ -13,7 +13,7 @@ from torch.profiler import ProfilerActivity, profile
 
 import full_eval
 import train
-from benchmarks.accuracy import oracle
+from benchmarks.accuracy import hashes, oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps
@@ -152,3 +152,22 @@ def test_runs_agree_with_the_oracle_and_are_reported(monkeypatch, capsys):
     for kernel, ratio in ((CPU_DOUBLE, "0.00"), (CPU_FLOAT, "1.00")):
         oracle.print_ratios(runs | {(case, CUDA_FLOAT): runs[case, kernel] for case in oracle.CASES})
         assert f"where either error exceeds 1e-06: {ratio} (at most 3 allowed)" in capsys.readouterr().out
+
+
+def test_equal_letters_are_equal_bytes(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(hashes, "TRAININGS", {"default": "--iterations 2", "seed": "--iterations 2 --seed 1"})
+    monkeypatch.setattr(hashes, "_SCENE", (3, 32, 24, 60, 0))
+    monkeypatch.setattr(sys, "argv", ["hashes", "--device", "cpu"])
+    hashes.main()
+    first = json.loads(capsys.readouterr().out)
+    other = first | {"sha256": first["sha256"] | {"seed": "0" * 64}}
+    (tmp_path / "other.jsonl").write_text(json.dumps(other))
+    monkeypatch.setattr(sys, "argv", ["hashes", "--device", "cpu", "--compare", str(tmp_path / "other.jsonl")])
+    hashes.main()
+    said = capsys.readouterr()
+    rows = [line.strip("|").split("|")[-4:] for line in said.err.splitlines() if line.startswith("|")]
+    assert json.loads(said.out)["sha256"] == first["sha256"]
+    assert [[cell.strip() for cell in row] for row in rows[2:]] == [["A", "A", "A", "A"], ["A", "A", "A", "B"]]
+    (tmp_path / "other.jsonl").write_text("{}")
+    with pytest.raises(UserError, match="--compare"):
+        hashes.main()
