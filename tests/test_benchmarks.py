@@ -17,7 +17,7 @@ from benchmarks.accuracy import hashes, oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps
-from benchmarks.scenes import scores
+from benchmarks.scenes import conversion, scores
 from benchmarks.scenes.thinned import thinned
 from scene.dataset_readers import read_scene
 from scene.point_depths import HELD_OUT
@@ -171,3 +171,16 @@ def test_equal_letters_are_equal_bytes(monkeypatch, tmp_path, capsys):
     (tmp_path / "other.jsonl").write_text("{}")
     with pytest.raises(UserError, match="--compare"):
         hashes.main()
+
+
+def test_stages_from_photos_to_a_page_are_in_their_order(tmp_path):
+    report = {"photos": 3, "seconds": {"mapping": 2.0, "features": 5.0}}
+    results = [
+        conversion.Result(10.0, 0, "", 1.0, report, later={"page": 4.0, "training": 20.0}),
+        conversion.Result(1.0, 2, "no photos", 1.0),
+    ]
+    labels = [["fox", ""], ["none", ""]]
+    assert conversion.stages_of(results) == ["features", "mapping", "rest", "training", "page"]
+    assert conversion.stage_table(labels, results) == [["fox", "", "5.0", "2.0", "3.0", "20.0", "4.0"]]
+    conversion.draw(tmp_path / "stages.png", labels, results)
+    assert (tmp_path / "stages.png").read_bytes().startswith(b"\x89PNG")

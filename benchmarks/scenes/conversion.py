@@ -1,11 +1,13 @@
 """What convert.py makes of sets of photos: seconds, photos placed, errors of places and lenses, and PSNR.
 
     python -m benchmarks.scenes.conversion SCENES --rows fox_raw bonsai400/2 --train 60
+    python -m benchmarks.scenes.conversion SCENES --rows fox_raw bonsai_small --train 20 --figure stages.png
 
 SCENES is as DIR of benchmarks.scenes.captures, which makes the sets. Rows take turns on all checkouts. A place's error
 is a share of the mean distance of the true cameras from their middle, after a robust similarity. `strangers` are photos
 that were placed though they have no place beside the others. The PSNR is of the test photos after a training on the
-result, and on the true poses of the same photos, as they were before undistortion.
+result, and on the true poses of the same photos, as they were before undistortion. The seconds of the stages end with
+those of the training's command and of a page; `rest` is what convert.py needs for its start and its report.
 """
 
 import argparse
@@ -27,7 +29,7 @@ from PIL import Image
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.captures import make, restricted
 from splatting.evaluation.model_folder import curve_of
-from utils.system_utils import UserError, run_cli
+from utils.system_utils import UserError, atomic_write, run_cli
 
 if TYPE_CHECKING:
     import pycolmap
@@ -36,6 +38,9 @@ _ROOT = Path(__file__).resolve().parents[2]
 _WRONG = 0.03  # share of the mean distance from the middle; places that are off by more are wrong
 _DRAWS, _REFITS = 1000, 10
 _SMALL = (48, 36)  # of frames that are compared
+# From photos to a page, as far as they take time.
+STAGES = ("video", "photos", "features", "matching", "mapping", "undistortion", "resize", "orient", "rest")
+STAGES += ("training", "page")
 # A small process starts the command: a process's peak counts that of the one that started it.
 _PEAK = """import resource, subprocess, sys
 status = subprocess.call(sys.argv[2:])
@@ -83,7 +88,10 @@ class Places:
 
 @dataclass
 class Result:
-    """A conversion. said: last line of its stderr; report: of convert_report.json; peak: MiB of the largest process."""
+    """A conversion. said: last line of its stderr; report: of convert_report.json; peak: MiB of the largest process.
+
+    later: seconds of training and page.
+    """
 
     seconds: float
     status: int
@@ -92,6 +100,13 @@ class Result:
     report: dict[str, Any] = field(default_factory=dict)
     places: Places | None = None
     psnr: tuple[float | None, float | None] = (None, None)
+    later: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def stages(self) -> dict[str, float]:
+        """Seconds of each stage of STAGES, as far as they are known."""
+        told = self.report.get("seconds") or {}
+        return told and told | {"rest": self.seconds - sum(told.values())} | self.later
 
 
 def convert(photos: Path, run: Path, options: Sequence[str], checkout: Path) -> Result:
@@ -215,6 +230,16 @@ def trained_psnr(scene: Path, model: Path, seconds: float) -> float | None:
     return next((row["test_psnr"] for row in reversed(curve_of(model)) if row["subset"] is None), None)
 
 
+def page_seconds(model: Path, page: Path) -> float:
+    """The seconds of export.py for a page. UserError if it fails."""
+    start = time.perf_counter()
+    command = [sys.executable, str(_ROOT / "export.py"), "-m", str(model), "--to", str(page), "--quiet"]
+    done = subprocess.run(command, cwd=_ROOT, capture_output=True, text=True)
+    if done.returncode:
+        raise UserError(f"the export of {model} failed:\n{done.stderr[-2000:]}")
+    return time.perf_counter() - start
+
+
 def measured(photos: Path, run: Path, options: Sequence[str], checkout: Path, seconds: float) -> Result:
     """Convert a set, compare the result with its truth, and train on it for some seconds, if they are not 0."""
     import pycolmap
@@ -226,9 +251,12 @@ def measured(photos: Path, run: Path, options: Sequence[str], checkout: Path, se
     result.places = beside(found, truth) if truth else None
     if seconds:
         official = write_official(run, found, truth) if result.places else None
-        models = [(run, run / "model"), *([(official, run / "official_model")] if official else [])]
-        scores = [trained_psnr(scene, model, seconds) for scene, model in models]
-        result.psnr = scores[0], scores[1] if official else None
+        start = time.perf_counter()
+        ours = trained_psnr(run, run / "model", seconds)
+        result.later["training"] = time.perf_counter() - start
+        if ours is not None:
+            result.later["page"] = page_seconds(run / "model", run / "page.html")
+        result.psnr = ours, trained_psnr(official, run / "official_model", seconds) if official else None
     return result
 
 
@@ -252,16 +280,40 @@ def cells(result: Result) -> list[str]:
     return [photos, f"{result.seconds:.1f}", placed, named, *compared, str(result.status), f"{result.peak:.0f}"]
 
 
-def stage_table(labels: Sequence[list[str]], results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
-    """Names of the stages in their order, and the seconds of each in each conversion that tells them."""
-    told = [result.report.get("seconds") or {} for result in results]
-    stages = list(dict.fromkeys(stage for seconds in told for stage in seconds))
-    rows = [
-        [*label, *(f"{seconds[stage]:.1f}" if stage in seconds else "" for stage in stages)]
-        for label, seconds in zip(labels, told, strict=True)
-        if seconds
+def stages_of(results: Sequence[Result]) -> list[str]:
+    """The stages of any of the results, in order."""
+    return [stage for stage in STAGES if any(stage in result.stages for result in results)]
+
+
+def stage_table(labels: Sequence[list[str]], results: Sequence[Result]) -> list[list[str]]:
+    """The seconds of each stage in each conversion that tells them."""
+    return [
+        [*label, *(f"{result.stages[stage]:.1f}" if stage in result.stages else "" for stage in stages_of(results))]
+        for label, result in zip(labels, results, strict=True)
+        if result.stages
     ]
-    return stages, rows
+
+
+def draw(path: Path, labels: Sequence[list[str]], results: Sequence[Result]) -> None:
+    """Draw a bar for each conversion, of the seconds of its stages."""
+    from matplotlib.figure import Figure
+
+    names = [" ".join(filter(None, label)) for label in labels]
+    names = [f"{name}\n{result.report.get('photos', 0)} photos" for name, result in zip(names, results, strict=True)]
+    figure = Figure(figsize=(9, 1.4 + 0.55 * len(names)), layout="constrained")
+    axes = figure.subplots()
+    ends = np.zeros(len(names))
+    for number, stage in enumerate(stages_of(results)):
+        seconds = np.array([result.stages.get(stage, 0.0) for result in results])
+        axes.barh(names, seconds, left=ends, label=stage, color=f"C{number}", height=0.65)
+        for row in np.flatnonzero(seconds > 0.04 * max(sum(result.stages.values()) for result in results)):
+            axes.text(ends[row] + seconds[row] / 2, row, f"{seconds[row]:.0f}", ha="center", va="center", fontsize=8)
+        ends += seconds
+    axes.invert_yaxis()
+    axes.set_xlabel("seconds")
+    figure.legend(loc="outside upper center", ncols=len(STAGES), fontsize=8, frameon=False)
+    with atomic_write(path) as temporary:
+        figure.savefig(temporary, dpi=100, metadata={"Software": None})
 
 
 def main() -> None:
@@ -272,6 +324,7 @@ def main() -> None:
     add("--rows", nargs="+", choices=names, default=names, metavar="NAME", help=f"sets (default: {', '.join(names)})")
     add("--out", type=Path, default=_ROOT / "build" / "conversion", help="folder for sets, which stay, and results")
     add("--train", type=float, default=0, metavar="SECONDS", help="of each training for the PSNR (default: none)")
+    add("--figure", type=Path, metavar="PNG", help="draw the seconds of the stages as bars")
     add("--options", default="", help="further ones of convert.py, as --options='...'")
     add("--checkout", type=Path, nargs="+", default=[_ROOT], metavar="DIR", help="code that converts (default: this)")
     args = parser.parse_args()
@@ -296,10 +349,11 @@ def main() -> None:
     header = [*code, *HEADER, *(["PSNR, dB", "true poses"] if args.train else [])]
     rows = zip(labels, results, scored, strict=True)
     print_table(header, [[*label, *cells(result), *(psnr if args.train else [])] for label, result, psnr in rows])
-    stages, seconds = stage_table(labels, results)
-    if seconds:
+    if seconds := stage_table(labels, results):
         print()
-        print_table([*code, *HEADER[:2], *(f"{stage}, s" for stage in stages)], seconds)
+        print_table([*code, *HEADER[:2], *(f"{stage}, s" for stage in stages_of(results))], seconds)
+    if args.figure:
+        draw(args.figure, labels, results)
 
 
 if __name__ == "__main__":
