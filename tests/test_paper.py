@@ -17,7 +17,7 @@ def test_a_row_for_each_run_and_for_each_mean():
     both["iterations"] |= {"10": both["iterations"]["20"] | {"PSNR": 20.5, "ply_mb": None}, "15": {"views": 0}}
     report = make_report(["x"], [*set_runs("attic"), *set_runs("brick"), failed, both])
     rows = list(csv.DictReader(io.StringIO(csv_text(report))))
-    assert {len(row) for row in rows} == {25} and len(rows) == 12 + 1 + 2 + 3
+    assert {len(row) for row in rows} == {26} and len(rows) == 12 + 1 + 2 + 3
     runs, means = [row for row in rows if row["scenes"] == "1"], [row for row in rows if row["scenes"] == "2"]
     first, mean = runs[0], means[0]
     assert [first[name] for name in ("group", "scene", "config", "seed")] == ["scenes", "attic", "adc", "0"]
