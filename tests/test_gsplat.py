@@ -453,6 +453,11 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ({"camera_model": "ftheta"}, "camera_model must be one of pinhole, fisheye, ortho, got 'ftheta'"),
         ({"eps2d": 1.5}, "eps2d must be 0 to 1 px.2, got 1.5"),
         ({"render_mode": "N"}, "render_mode must be one of RGB, D"),
+        ({"render_mode": "RGB-Ed"}, r"render_mode 'RGB-Ed' needs with_eval3d, .*; take 'RGB\+ED'"),
+        (
+            {"sh_degree": 2, "colors": torch.zeros(60, 4, 3, dtype=DOUBLE)},
+            "colors of degree 2 must have 9 bands, got 4",
+        ),
         ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),
         ({"viewmats": torch.eye(4, dtype=DOUBLE)}, r"viewmats must be \(1, 4, 4\), got \(4, 4\)"),
         (

@@ -78,9 +78,8 @@ def checked(given: dict[str, Any]) -> tuple[Call, Tensor | None, int]:
     if shutter is not None and getattr(shutter, "name", "GLOBAL") != "GLOBAL":
         raise ValueError("rolling_shutter is not supported; take poses of a global shutter")
     if mode in ("d", "Ed", "RGB-d", "RGB-Ed"):
-        raise ValueError(
-            f"render_mode {mode!r} needs with_eval3d, which is not supported; take {mode.upper()!r}".replace("-", "+")
-        )
+        along_axis = mode.upper().replace("-", "+")
+        raise ValueError(f"render_mode {mode!r} needs with_eval3d, which is not supported; take {along_axis!r}")
     for name, choices in _CHOICES.items():
         if given[name] not in choices:
             raise ValueError(f"{name} must be one of {', '.join(choices)}, got {given[name]!r}")
