@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from splatting.evaluation.error_curve import COLUMNS
-from splatting.evaluation.figures import draw_cameras, draw_curve, draw_curves
+from splatting.evaluation.figures import draw_cameras, draw_curve, draw_curves, draw_sizes
 from splatting.evaluation.report import _from_above
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
@@ -98,6 +98,22 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
     assert said == ["2 of 7 test views; hollow, other programs and the end: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
+
+
+def test_psnr_against_size_has_a_line_for_sets_that_differ_in_their_last_word(tmp_path, drawn):
+    ends = {"adc-2k": (2000, 30.0), "adc-1k": (900, 29.0), "mcmc-1k": (1000, 29.5), "budget": (500, 28.0)}
+    common = {"seed": 0, "apart": False, "final_iteration": 7}
+    runs = [
+        common | {"config": name, "iterations": {"7": {"PSNR": psnr, "gaussians": count}}}
+        for name, (count, psnr) in ends.items()
+    ]
+    runs += [runs[0] | {"seed": 1}, runs[0] | {"apart": True, "config": "x"}, runs[1] | {"final_iteration": None}]
+    assert [file.name for file in draw_sizes(tmp_path, "attic", runs)] == ["attic_size.png"]
+    (axes,) = drawn[0].axes
+    assert points(axes, "adc") == [[[900, 29.0], [2000, 30.0]]] and points(axes, "mcmc") == [[[1000, 29.5]]]
+    assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["adc", "mcmc", "budget"]
+    assert sum(len(line.get_xdata()) for line in axes.lines) == 5
+    assert draw_sizes(tmp_path, "attic", runs[:1]) == draw_sizes(tmp_path, "attic", runs[-1:]) == []
 
 
 def test_cameras_from_above_are_drawn_once_for_each_split(tmp_path, drawn):

@@ -46,7 +46,8 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
     monkeypatch.setattr(full_eval, "facts_asked", lambda: MACHINE)
-    monkeypatch.setattr(report_module, "draw_curves", lambda *_: [])  # half a second each; see `figures`
+    for name in ("draw_curves", "draw_sizes"):
+        monkeypatch.setattr(report_module, name, lambda *_: [])  # half a second each; see `figures`
 
 
 @pytest.fixture

@@ -7,23 +7,15 @@ GPU. Differences are between trainings of the same seed: mean and standard error
 """
 
 import argparse
-import contextlib
 import importlib
-import io
-import multiprocessing
-import os
 import statistics
 import sys
-import tempfile
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from tqdm import tqdm
+from typing import NamedTuple
 
 from benchmarks.harness.measuring import describe, print_table
-from splatting.evaluation.error_curve import NAME, read_curve
+from benchmarks.harness.trainings import Training, train_all
 from utils.system_utils import run_cli
 
 OPTIONS = (
@@ -69,26 +61,14 @@ def changed(constant: str, factor: float) -> float:
     return max(round(new), 1) if isinstance(value, int) else new
 
 
-def train_with(job: Job, words: Sequence[str], gpus: Any) -> float:
-    """Train in this process, and return the PSNR of the test views at the end (dB)."""
-    import train
-
-    gpu = gpus.get()
-    if gpu is not None:
-        os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)
-    options: list[str] = []
+def training_of(job: Job, words: Sequence[str]) -> Training:
+    """The training of a job. words: of the command line."""
+    base = ("-s", job.scene, "--strategy", "budget", "--seed", str(job.seed), *words)
     if job.constant in OPTIONS:
-        options = [f"--{job.constant}", str(changed(job.constant, job.factor))]
-    elif job.constant:
-        module = importlib.import_module(ATTRIBUTES[job.constant])
-        setattr(module, job.constant, changed(job.constant, job.factor))
-    try:
-        with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
-            base = ["-s", job.scene, "-m", out, "--eval", "--quiet", "--disable_viewer", "--no_last_checkpoint"]
-            train.main([*base, "--strategy", "budget", "--seed", str(job.seed), *words, *options])
-            return [row["test_psnr"] for row in read_curve(Path(out) / NAME) if row["test_psnr"] is not None][-1]
-    finally:
-        gpus.put(gpu)
+        return Training((*base, f"--{job.constant}", str(changed(job.constant, job.factor))))
+    if not job.constant:
+        return Training(base)
+    return Training(base, {f"{ATTRIBUTES[job.constant]}:{job.constant}": changed(job.constant, job.factor)})
 
 
 def table(jobs: Sequence[Job], found: dict[Job, float], seeds: Sequence[int], scenes: Sequence[str]) -> list[list[str]]:
@@ -119,16 +99,8 @@ def main() -> None:
     args = parser.parse_args(words[:cut])
     changes = [("", 1.0), *((name, factor) for name in args.constants for factor in (0.5, 2.0))]
     jobs = [Job(scene, *change, seed) for change in changes for scene in args.scenes for seed in args.seeds]
-    context = multiprocessing.get_context("spawn")
-    with context.Manager() as manager:
-        gpus = manager.Queue()
-        for gpu in args.gpus or [None]:
-            gpus.put(gpu)
-        with context.Pool(len(args.gpus or [None]), maxtasksperchild=1) as pool:
-            run = partial(train_with, words=words[cut + 1 :], gpus=gpus)
-            found = dict(zip(jobs, tqdm(pool.imap(run, jobs), total=len(jobs), unit="training"), strict=True))
-            pool.close()
-            pool.join()
+    records = train_all([training_of(job, words[cut + 1 :]) for job in jobs], args.gpus)
+    found = {job: record["test_psnr"] for job, record in zip(jobs, records, strict=True)}
     names = [Path(scene).name for scene in args.scenes]
     print(describe("cuda" if args.gpus else "cpu"))
     header = ["constant", "value", *(f"{name}: {what}" for name in names for what in ("halved", "doubled"))]

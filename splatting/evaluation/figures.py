@@ -201,6 +201,30 @@ def draw_curves(
     ]
 
 
+def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
+    """Draw test PSNR against the number of Gaussians trained; return the file, none for fewer than two option sets.
+
+    Sets whose names agree up to the last hyphen, as adc-100k and adc-200k, are joined by a line for each seed.
+    """
+    lines: dict[tuple[str, Any], list[Point]] = {}
+    for run in runs:
+        end = run["iterations"].get(str(run["final_iteration"]), {})
+        if end.get("PSNR") is not None and end["gaussians"] and not run["apart"]:
+            name = run["config"] or "no option set"
+            lines.setdefault((name.rpartition("-")[0] or name, run["seed"]), []).append((end["gaussians"], end["PSNR"]))
+    names = list(dict.fromkeys(name for name, _ in lines))
+
+    def draw(axes: Axes) -> None:
+        for (name, _), points in lines.items():
+            again = name in axes.get_legend_handles_labels()[1]
+            style = {"color": f"C{names.index(name) % 10}", "marker": "o", "markersize": 3.5, "linewidth": 1.2}
+            _draw(axes, sorted(points), None if again else name, **style)
+
+    labels = "Gaussians trained", "PSNR of the test views (dB)"
+    several = lines and len({run["config"] for run in runs}) > 1
+    return [_panel(folder / f"{scene}_size.png", scene, False, labels, draw)] if several else []
+
+
 def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
     """Draw how far refined poses have turned, on the mean, against seconds of training; return the file, if any."""
     shown = [run for run in runs if run.get("poses")]  # reports of older versions lack it

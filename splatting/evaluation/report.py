@@ -19,7 +19,7 @@ from markupsafe import Markup
 
 from scene.readers.info import from_above, up_of
 from splatting.evaluation import comparison, tables
-from splatting.evaluation.figures import draw_cameras, draw_curves, draw_poses
+from splatting.evaluation.figures import draw_cameras, draw_curves, draw_poses, draw_sizes
 from splatting.evaluation.gains import gains
 from splatting.evaluation.model_folder import json_or_none
 from splatting.evaluation.paper import csv_text, tex_text
@@ -42,7 +42,9 @@ _NUMBER = re.compile(r"[\d.,]*\d")
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[str, Mapping[str, Any]]  # by scene: paths of `cameras`, `curves`, `poses`, `masked`; `views`
+Pictures = Mapping[
+    str, Mapping[str, Any]
+]  # by scene: paths of `cameras`, `curves`, `sizes`, `poses`, `masked`; `views`
 
 
 def make_report(
@@ -122,6 +124,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             "cameras": _figures(draw_cameras, folder, scene, _from_above(output, members)),
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
+            "sizes": _figures(draw_sizes, folder, scene, members),
             "masked": [path for run in members for path in _of_parts(output / run["model"])],
             "views": _views(output, scene, members, each),
         }

@@ -1,0 +1,67 @@
+"""Trainings with changed constants of the code, each in a process of its own."""
+
+import contextlib
+import importlib
+import io
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
+
+from splatting.evaluation.error_curve import NAME, read_curve, whole_sets
+from splatting.files.json_files import read_json
+
+
+class Training(NamedTuple):
+    """Words for train.py, and constants to change before it starts: "module:name" and value."""
+
+    words: tuple[str, ...]
+    changes: Mapping[str, Any] = {}
+
+
+def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> list[dict[str, Any]]:
+    """Train with --eval, and return what `_train` does for each.
+
+    gpus: one training at a time for each number; None: one after another, on the CPU or the only GPU.
+    """
+    context = multiprocessing.get_context("spawn")
+    slots = gpus or [None]
+    with context.Manager() as manager:
+        free = manager.Queue()
+        for slot in slots:
+            free.put(slot)
+        with context.Pool(len(slots), maxtasksperchild=1) as pool:
+            found = pool.imap(partial(_train, gpus=free), trainings, chunksize=1)
+            records = list(tqdm(found, total=len(trainings), unit="training"))
+            pool.close()
+            pool.join()
+    return records
+
+
+def _train(training: Training, gpus: Any) -> dict[str, Any]:
+    """Train in this process; return the last record of train_log.json, with `test_psnr` (dB) and `ply_mb` (10^6 bytes).
+
+    test_psnr: of all test views at the end.
+    """
+    import train
+
+    if (gpu := gpus.get()) is not None:
+        os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)
+    for name, value in training.changes.items():
+        module, attribute = name.split(":")
+        setattr(importlib.import_module(module), attribute, value)
+    try:
+        with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
+            fixed = "--eval", "--quiet", "--disable_viewer", "--no_last_checkpoint"
+            train.main(["-m", out, *fixed, *training.words])
+            psnr = whole_sets(read_curve(Path(out) / NAME))[-1]["test_psnr"]
+            saved = max(Path(out).glob("point_cloud/*/point_cloud.ply"), key=lambda file: file.stat().st_mtime_ns)
+            last = read_json(Path(out) / "train_log.json")[-1]
+            return last | {"test_psnr": psnr, "ply_mb": saved.stat().st_size / 1e6}
+    finally:
+        gpus.put(gpu)

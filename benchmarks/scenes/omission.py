@@ -1,0 +1,96 @@
+"""What a training leaves out by itself: what each omission saves, and what it costs in PSNR.
+
+    python -m benchmarks.scenes.omission SCENE ... --seeds 0 1 2 --gpus 0 1 -- --iterations 7000
+
+Words after -- go to train.py. The first row has the medians of trainings that leave out all that the code does. Each
+other row leaves one thing in; its numbers are medians of the differences from the first, by pairs of one seed.
+"""
+
+import argparse
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.trainings import Training, train_all
+from utils.system_utils import run_cli
+
+
+class Omission(NamedTuple):
+    """What switches an omission off: words for train.py, and constants of the code."""
+
+    words: tuple[str, ...] = ()
+    changes: dict[str, Any] = {}
+
+
+NOTHING = "nothing"
+OMISSIONS = {
+    NOTHING: Omission(),
+    "rows that sleep": Omission(changes={"scene.sleeping:MOST_SHARE": 0.0}),
+    "SH bands before their turn": Omission(changes={"splatting.training.run:SH_INTERVAL": 1}),
+    "Gaussians unseen at the end": Omission(("--keep_unseen",)),
+    "large photos of a short training": Omission(
+        changes={"splatting.parts.time_budget_schedule:PYRAMID": ((0.0, 1.0),)}
+    ),
+}
+COLUMNS = {  # heading: key of a record, digits
+    "seconds": ("seconds", 2),
+    "joules": ("joules", 0),
+    "MiB at most": ("peak_memory_mib", 0),
+    "MB of the PLY": ("ply_mb", 2),
+    "PSNR (dB)": ("test_psnr", 3),
+}
+
+
+def rows_of(names: Sequence[str], records: Sequence[dict[str, Any]]) -> list[list[str]]:
+    """Rows of the table of one scene: medians, then what leaving one thing in adds to them.
+
+    records: for each seed in turn, of each name, of which the first is NOTHING.
+    """
+    of = {name: records[place :: len(names)] for place, name in enumerate(names)}
+    rows = []
+    for name in names:
+        cells = []
+        for key, digits in COLUMNS.values():
+            with_all = [record.get(key) for record in of[NOTHING]]
+            values = [record.get(key) for record in of[name]]
+            if None in (*with_all, *values):
+                cells.append("-")
+            elif name == NOTHING:
+                cells.append(f"{statistics.median(values):,.{digits}f}")
+            else:
+                saved = [value - before for value, before in zip(values, with_all, strict=True)]
+                cells.append(f"{statistics.median(saved):+,.{digits}f}")
+        rows.append([name, *cells])
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("scenes", nargs="+", help="scenes with test views")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="default: 0 1 2")
+    parser.add_argument("--gpus", type=int, nargs="+", help="one training at a time for each number; default: one")
+    parser.add_argument("--left_in", nargs="+", choices=OMISSIONS, default=list(OMISSIONS), help="default: all")
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    args = parser.parse_args(words[:cut])
+    names = list(dict.fromkeys([NOTHING, *args.left_in]))
+    trainings = [
+        Training(("-s", scene, "--seed", str(seed), *words[cut + 1 :], *OMISSIONS[name].words), OMISSIONS[name].changes)
+        for scene in args.scenes
+        for seed in args.seeds
+        for name in names
+    ]
+    records = train_all(trainings, args.gpus)
+    print(describe("cuda" if args.gpus else "cpu"))
+    each = len(names) * len(args.seeds)
+    for place, scene in enumerate(args.scenes):
+        print(f"\n{Path(scene).name}\n")
+        part = records[place * each : (place + 1) * each]
+        print_table(["left in", *COLUMNS], rows_of(names, part))
+
+
+if __name__ == "__main__":
+    run_cli(main)
