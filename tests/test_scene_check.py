@@ -10,6 +10,7 @@ import pycolmap
 import pytest
 import torch
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 from synthetic import BROWN, as_text, edit_json, make_blender_scene, make_colmap_scene, read
 
 from scene.gaussians.copies import places_of
@@ -19,7 +20,7 @@ from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, local, world_offset
 from splatting.findings import Finding, Severity
-from splatting.findings.photo_files import damaged, of_damage
+from splatting.findings.photo_files import damaged, of_blur, of_damage
 from splatting.findings.photos import of_photos
 from splatting.findings.scene import check_dataset, findings, tell
 from splatting.sfm.images import check_images
@@ -164,6 +165,31 @@ def test_jpegs_with_a_damaged_middle_are_named(sound, tmp_path, capsys, zeros):
 def test_grey_photos_and_those_of_a_low_quality_are_not_damaged(usual, most, named):
     """Sound ones have so large shares of equal blocks: scenes of real photos, saved as grey, or in quality 30."""
     assert any(damaged(dict.fromkeys("abcdefg", usual) | {"h": most})) == named
+
+
+def test_blurred_photos_are_named_whatever_they_show(sound, tmp_path):
+    """Also if half of them are: from rich to plain, bright to dark, small to large, and in any direction."""
+    rng, views = np.random.default_rng(1), []
+    for n, view in enumerate(read(sound).train_cameras[:8]):
+        texture = sum(s * gaussian_filter(rng.normal(size=(300, 400, 3)), (s, s, 0)) for s in (0.6, 2, 4, 8))
+        wall = texture * 60 * 0.97**n + 150 - 10 * n
+        moved = np.mean(
+            [
+                np.roll(wall, (round(k * np.sin(n * np.pi / 6)), round(k * np.cos(n * np.pi / 6))), (0, 1))
+                for k in range(16)
+            ],
+            0,
+        )
+        pixels = Image.fromarray((moved if n % 2 else wall).clip(0, 255).astype(np.uint8))
+        path = tmp_path / f"{n}.png"
+        (pixels.crop((0, 0, 200, 200)) if n > 5 else pixels).save(path)
+        views.append(replace(view, image_path=path, image_name=path.name))
+    info = read(sound)._replace(train_cameras=views)
+    (found,) = of_blur(info, 100)
+    assert str(found).startswith("4 of 8 photos look blurred (1.png, 3.png, 5.png, 7.png); take them out")
+    assert [*of_blur(info._replace(train_cameras=views[::2]), 100)] == [*of_blur(_with_photos(COLORS), 9)] == []
+    Image.new("RGB", (64, 48)).save(views[0].image_path)
+    assert len([*of_blur(info._replace(train_cameras=views[::2]), 100)]) == 0
 
 
 def test_sound_photos_are_passed():

@@ -18,10 +18,10 @@ def exposures(colors: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.
     """
     usable = [(values.max(1, initial=0) < _LIGHT) & (values.min(1, initial=1) > _DARK) for values in colors]
     logs = [np.log2(_linear(values[some]) @ _LUMINANCE) for values, some in zip(colors, usable, strict=True)]
-    return levels(logs, [numbers[some] for numbers, some in zip(points, usable, strict=True)], _OUTLIER)
+    return _levels(logs, [numbers[some] for numbers, some in zip(points, usable, strict=True)])
 
 
-def levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray], outlier: float) -> np.ndarray:
+def _levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.ndarray:
     """What N photos add to values (K,) of their points, around its mean (N,): a robust fit of photo plus point."""
     value, photo = np.concatenate(values), np.repeat(np.arange(len(values)), [len(one) for one in values])
     point = np.unique(np.concatenate(points), return_inverse=True)[1]
@@ -29,7 +29,7 @@ def levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray], outlier: 
     for _ in range(_ROUNDS):
         level, own = _fitted(value, weight, photo, point, len(values))
         away = value - level[photo] - own[point]
-        weight = np.maximum(1 - (away / outlier) ** 2, 1e-3) ** 2
+        weight = np.maximum(1 - (away / _OUTLIER) ** 2, 1e-3) ** 2
     return level - level.mean()
 
 

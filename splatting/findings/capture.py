@@ -15,6 +15,7 @@ from scene.images.exif import Lens
 from scene.images.exposures import EXPOSURES
 from splatting.files.json_files import read_json
 from splatting.findings import Finding, fine
+from splatting.findings.photo_files import blurred
 from splatting.findings.points import FEWEST_POINTS
 from splatting.host.listing import some
 from splatting.registry import tools
@@ -36,14 +37,13 @@ SHARED = 30  # points that a photo shares with another one that is near
 FEW = 2  # such neighbours, with which a photo is weakly connected
 _MANY = 0.05  # share of a camera's photos: a few may be wrong for other reasons
 _FEWEST = 3
-_BLURRED = 0.3  # of the median sharpness
 _EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
 _BY_HAND = "--cameras per_photo, or put the photos of each lens into a sub-folder and use --cameras per_folder"
 _OVERLAPPING = "each overlapping the one before by 60 to 80 %"
 
 
 class Look(NamedTuple):
-    """A photo's sharpness (mean squared difference of neighbours) and brightness (stops)."""
+    """A photo's sharpness (photo_files.sharpness) and brightness (stops)."""
 
     sharpness: float
     brightness: float
@@ -202,19 +202,18 @@ def worth(
     neighbours = neighbours_of(photos)
     against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}
     weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
-    middle = float(np.median([look.sharpness for look in looks.values()])) if looks else 0.0
-    blurred = sorted(name for name, look in looks.items() if look.sharpness < _BLURRED * middle)
+    soft = blurred({name: look.sharpness for name, look in looks.items()})
     bright = [look.brightness for name, look in looks.items() if name in photos and math.isfinite(look.brightness)]
     spread = round(float(np.std(bright)), 3) if bright else None
     return {
         "weakly_connected": weak,
-        "blurred": blurred,
+        "blurred": soft,
         "brightness_spread_stops": spread,
-        "again": _again(sorted(set(report["left_out"]) - against), weak, blurred, spread),
+        "again": _again(sorted(set(report["left_out"]) - against), weak, soft, spread),
     }
 
 
-def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: float | None) -> list[str]:
+def _again(left_out: list[str], weak: list[str], soft: list[str], spread: float | None) -> list[str]:
     lines = []
     if left_out:
         lines.append(
@@ -223,8 +222,8 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
         )
     if weak:
         lines.append(f"around {some(weak)}: fewer than {FEW} other photos share points with each; take more there")
-    if blurred:
-        lines.append(f"{some(blurred)}: blurred; hold the camera still, or add light")
+    if soft:
+        lines.append(f"{some(soft)}: blurred; hold the camera still, or add light")
     if spread and spread > EXPOSURES:
         lines.append(
             f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
@@ -235,13 +234,13 @@ def _again(left_out: list[str], weak: list[str], blurred: list[str], spread: flo
 
 def lines_of(report: Mapping[str, Any]) -> list[str]:
     """The report of a capture in a few lines, after its summary."""
-    weak, blurred = report["weakly_connected"], report["blurred"]
+    weak, soft = report["weakly_connected"], report["blurred"]
     lines = []
     if weak or not unusable(report):
         few = f"{len(weak)} of {report['registered']} photos weakly connected ({some(weak)})"
         lines.append(f"overlap: {few if weak else 'no photo is weakly connected'}")
-    soft = f"{len(blurred)} of {report['photos']} photos blurred ({some(blurred)})"
-    lines.append(f"blur: {soft if blurred else 'no photo is blurred'}")
+    said = f"{len(soft)} of {report['photos']} photos blurred ({some(soft)})"
+    lines.append(f"blur: {said if soft else 'no photo is blurred'}")
     if (spread := report["brightness_spread_stops"]) is not None:
         lines.append(f"brightness: the photos differ by {spread:.2f} stops")
     lines += [f"photograph again {line}" for line in report["again"]]

@@ -1,8 +1,10 @@
-"""Files of photos: the same photo twice, which counts twice or is scored after it has trained, and damaged JPEGs.
+"""Files of photos: the same photo twice, which counts twice or is scored after it has trained, damaged JPEGs, and blur.
 
 Decoders pass over damage in the middle of a JPEG: what follows is in wrong colours and places. Where the coded data end
 too early, or are zeros, they repeat the last colour: blocks of 8 pixels a side that are exactly equal, in long runs,
 which photos have none of.
+
+Blur takes fine detail more than coarse detail of the same photo, whatever it shows: see `sharpness`.
 """
 
 import hashlib
@@ -15,9 +17,11 @@ from statistics import median
 import numpy as np
 
 from scene.readers.info import CameraInfo, SceneInfo
+from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.findings import Finding
 from splatting.host.listing import some
+from utils.system_utils import UserError
 
 _PART = 1 << 16  # bytes at the ends and in the middle that are compared first
 _SAME_PLACE, _SAME_TURN = 0.02, 0.02  # extents, and radians: a pose that was found twice
@@ -27,6 +31,10 @@ _SHARE = 0.02  # of the blocks; sound photos have 0.0075 at most, grey ones 0.01
 _USUAL = 8  # times the photos' median; sound ones of a low quality have 0.12 and 7.5 times that
 _CLIPPED = 8  # of 255, from black and white, which photos have much of
 _FEW = 0.25  # of the photos; where more have it, it is a background
+_WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
+_COARSE = 4  # pixels
+_DIRECTIONS = np.array([(0, 1), (1, 0), (1, 1), (1, -1)])
+_BLURRED = 0.25  # of the sharpness of the sharper half's middle; sharp photos have 0.41 and more, 8 % of motion 0.2
 
 
 def of_duplicates(info: SceneInfo, halves: bool = False) -> Iterator[Finding]:
@@ -130,6 +138,59 @@ def damaged(shares: Mapping[str, float | None]) -> Iterator[Finding]:
         text = f"{len(found)} of the {len(known)} JPEG photos that were checked are likely damaged in the middle"
         text += f", as parts of them are of exactly one colour ({some(found)})"
         yield Finding(text, "copy them again, or take them out of the scene")
+
+
+def of_blur(info: SceneInfo, most: int) -> Iterator[Finding]:
+    """Blurred photos, among at most `most` in a random order."""
+    found = {}
+    for number in np.random.default_rng(0).permutation(len(info.train_cameras))[:most]:
+        view = info.train_cameras[number]
+        try:
+            found[view.image_name] = sharpness(small(Path(view.image_path)))
+        except (*UNREADABLE, UserError, TypeError):
+            continue  # of a reader that reads photos from elsewhere
+    if soft := blurred(found):
+        text = f"{len(soft)} of {len(found)} photos look blurred ({some(soft)})"
+        yield Finding(text, "take them out of the scene if others show the same; hold the camera still, or add light")
+
+
+def small(path: Path) -> np.ndarray:
+    """A photo (H, W, 3) uint8 in sRGB, of the size at which photos are compared."""
+    with open_image(path) as image:
+        image.draft("RGB", (_WIDTH, _WIDTH))
+        pixels = in_srgb(image).convert("RGB")
+        pixels.thumbnail((_WIDTH, _WIDTH))
+        return np.asarray(pixels)
+
+
+def sharpness(pixels: np.ndarray) -> float:
+    """How much of a photo's detail is fine, along the direction in which that is least, as motion blurs along one.
+
+    pixels: (H, W, 3), 0 to 255. It is the energy of second differences (after Nayar and Nakagawa 1994) at a distance of
+    one pixel over that at _COARSE. A photo without detail is as sharp as can be.
+    """
+    grey = pixels.mean(2, dtype=np.float32)
+    if min(grey.shape) <= 2 * _COARSE:
+        return np.inf
+    energies = ((_curvature(grey, step), _curvature(grey, step * _COARSE)) for step in _DIRECTIONS)
+    return min(fine / coarse if coarse > 0.5 else np.inf for fine, coarse in energies)
+
+
+def _curvature(grey: np.ndarray, step: np.ndarray) -> float:
+    """Mean square of second differences at a step (rows, columns)."""
+    margin = np.abs(step)
+
+    def moved(times: int) -> np.ndarray:
+        (top, left), (height, width) = margin + times * step, grey.shape - 2 * margin
+        return grey[top : top + height, left : left + width]
+
+    return float(np.square(2 * moved(0) - moved(-1) - moved(1)).mean())
+
+
+def blurred(found: Mapping[str, float]) -> list[str]:
+    """Names of blurred photos, by the `sharpness` of all. They may be half of them."""
+    middle = np.quantile(list(found.values()), 0.75, method="lower") if found else 0.0
+    return sorted(name for name, value in found.items() if value < _BLURRED * middle)
 
 
 def equal_share(path: Path) -> tuple[float | None, int]:

@@ -15,7 +15,7 @@ from splatting.findings import Finding, Severity, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
 from splatting.findings.capture import check_conversion, left_out
 from splatting.findings.fit import check_agreement, check_geometry
-from splatting.findings.photo_files import of_damage, of_duplicates
+from splatting.findings.photo_files import of_blur, of_damage, of_duplicates
 from splatting.findings.photos import check_views, hints, of_photos
 from splatting.findings.points import check_cloud, of_points
 from utils.system_utils import UserError
@@ -88,7 +88,7 @@ def check_dataset(source: str, images: str) -> list[Finding]:
         return [*_notes(said.getvalue()), from_error(error)]
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
-    checks += [findings(info, most=MOST_PHOTOS)]
+    checks += [findings(info, most=MOST_PHOTOS), of_blur(info, MOST_PHOTOS)]
     if not any(of_lenses(info)):  # else poses and colours have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]

@@ -70,7 +70,7 @@ def advise_trained(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
     from splatting.parts.robust_mask_residuals import FEW, MASKED, odd_share, residuals_of
 
     share = odd_share(residuals_of(scene.getTrainCameras(), views, scene.gaussians))
-    text = f"{share:.0%} of the photos show objects that a short training does not, such as passers-by"
+    text = f"{share:.0%} of the photos show what a short training does not, such as passers-by or reflections"
     yield note(text, f"--robust_mask {MASKED:g}" if share > FEW else "")
 
 
@@ -88,7 +88,7 @@ def examine(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
     found = {camera.image_name: masks.counted(camera) for camera in cameras}
     shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
     if worst := sorted(shares, key=shares.get, reverse=True):
-        text = f"{len(worst)} of {len(cameras)} photos show objects that the model does not, such as passers-by"
+        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, such as passers-by or reflections"
         yield note(f"{text}: most in {some(worst)}", f"--robust_mask {MASKED:g}")
 
 

@@ -9,20 +9,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 from tqdm.contrib.concurrent import thread_map
 
-from scene.images.exposures import exposures, levels
+from scene.images.exposures import exposures
 from scene.readers.colmap import read_model
-from splatting.files.color_profiles import in_srgb
-from splatting.files.image_files import open_image
 from splatting.findings.capture import SHARED, Look
+from splatting.findings.photo_files import sharpness, small
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout
-from splatting.sfm.video import sharpness
-
-_TEXTURE, _OUTLIER = 9, 3.0  # pixels around a point that tell sharpness, and what is no sharpness (logarithm to 2)
-_WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
 
 
 def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:
@@ -33,16 +27,15 @@ def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:
 
 
 def _look(path: Path) -> Look:
-    pixels = _small(path)
+    pixels = small(path)
     light = (pixels.astype(np.float32).mean() / 255) ** 2.2  # about the inverse of sRGB's curve
     return Look(sharpness(pixels), math.log2(max(float(light), 1e-4)))
 
 
 def compared(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
-    """Looks of photos, those of the placed ones by the points that they share with others.
+    """Looks of photos, with the brightness of the placed ones by the points that they share with others.
 
-    A photo of a dark wall is neither blurred nor of another exposure. One that shares few points is taken as sharp, and
-    its brightness as unknown, NaN.
+    A photo of a dark wall is of no other exposure. One that shares few points has an unknown brightness, NaN.
     """
     model = read_model(layout.sparse / "0", with_2d_points=True)
     images = [image for image in model.images if image.name in looks]
@@ -51,36 +44,25 @@ def compared(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
         lambda image, size: _at_points(layout.images / image.name, image.xys / size, image.point3D_ids),
         images, sizes, max_workers=threads(), desc="Comparing photos", dynamic_ncols=True,
     )  # fmt: skip
-    middle = Look(*np.median(list(looks.values()), axis=0)) if looks else Look(1, 0)
-    enough = [number for number, (points, _, _) in enumerate(seen) if len(points) >= SHARED]
-    found = {image.name: Look(middle.sharpness, math.nan) for image in images}
+    enough = [number for number, (points, _) in enumerate(seen) if len(points) >= SHARED]
+    found = {image.name: looks[image.name]._replace(brightness=math.nan) for image in images}
     if len(enough) > 1:
-        points, colors, textures = zip(*(seen[number] for number in enough), strict=True)
-        sharper, brighter = levels(textures, points, _OUTLIER), exposures(colors, points)
-        sharper, brighter = sharper - np.median(sharper), brighter - np.median(brighter)
-        for number, sharp, bright in zip(enough, sharper, brighter, strict=True):
-            found[images[number].name] = Look(middle.sharpness * 2**sharp, middle.brightness + bright)
+        points, colors = zip(*(seen[number] for number in enough), strict=True)
+        brighter, middle = exposures(colors, points), np.median([look.brightness for look in looks.values()])
+        for number, bright in zip(enough, brighter - np.median(brighter), strict=True):
+            name = images[number].name
+            found[name] = found[name]._replace(brightness=middle + bright)
     return {**looks, **found}
 
 
-def _at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of the points (K,) that a photo shows their numbers, colours (K,3), and logarithms of contrast (K,).
+def _at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of the points (K,) that a photo shows their numbers and colours (K,3).
 
     places: (K,2), in parts of the photo's width and height. numbers: negative where there is no point.
     """
-    pixels = _small(path)
+    pixels = small(path)
     size = pixels.shape[1::-1]
     places = (places * size).astype(int)
     inside = (numbers >= 0) & (places >= 0).all(1) & (places < size).all(1)
     column, row = places[inside].T
-    grey = pixels.mean(2, dtype=np.float32) + 1
-    steps = sum(np.square(change) for change in np.gradient(grey))
-    contrast = (uniform_filter(steps, _TEXTURE) + 1)[row, column] / uniform_filter(grey, _TEXTURE)[row, column] ** 2
-    return numbers[inside], pixels[row, column] / 255, np.log2(contrast)
-
-
-def _small(path: Path) -> np.ndarray:
-    with open_image(path) as image:
-        small = in_srgb(image).convert("RGB")
-        small.thumbnail((_WIDTH, _WIDTH))
-        return np.asarray(small)
+    return numbers[inside], pixels[row, column] / 255
