@@ -314,6 +314,36 @@ def test_means2d_gets_its_gradient_in_pixels(packed):
     assert torch.allclose(meta["means2d"].grad, gradient)
 
 
+@CPU_AND_GPU
+def test_radii_tell_whether_a_box_around_the_mean_meets_the_image(device):
+    """As in gsplat, whose strategies count views by them. Whether it reaches the centre of a pixel does not matter."""
+    given = Inputs(4, count=4000)
+    with torch.no_grad():
+        given.means *= 2
+        given.scales *= 0.1
+        given.opacities *= torch.linspace(0, 0.05, 4000, dtype=DOUBLE)
+    notes = described(given, False, 0.3)
+    variance = torch.linalg.inv(notes["conics"][..., [0, 1, 1, 2]].unflatten(-1, (2, 2))).diagonal(dim1=-2, dim2=-1)
+    reach = (2 * (255 * notes["opacities"]).log()).clamp_min(0).sqrt().clamp_max(3.33)[..., None]
+    radii = (reach * variance.sqrt()).ceil()
+    size = torch.tensor([WIDTH, HEIGHT])
+    beyond = torch.minimum(notes["means2d"] + radii, size - notes["means2d"] + radii).amin(-1)
+    shown = (notes["depths"] > 0.01) & (reach[..., 0] > 0) & (beyond > 0)
+    for name in (*NAMES, "Ks", "backgrounds"):
+        value = getattr(given, name).detach().to(device, torch.float32 if device == "cuda" else DOUBLE)
+        setattr(given, name, value.requires_grad_(name == "opacities"))
+    image, _, meta = given.draw(packed=False)
+    found, tiles = meta["radii"].cpu(), meta["tiles_per_gauss"].cpu() > 0
+    sure = (beyond.abs() > 1e-3) & ((notes["depths"] - 0.01).abs() > 1e-3)
+    assert torch.equal((found > 0).all(-1)[sure], shown[sure]) and sure.double().mean() > 0.99
+    assert (found - radii)[shown & sure].abs().max() <= (device == "cuda") and not (tiles & ~shown)[sure].any()
+    assert (shown & ~tiles).sum() > 0.01 * shown.sum()
+    packed = given.draw(packed=True)[2]
+    assert torch.equal(packed["gaussian_ids"].cpu(), (found > 0).all(-1).nonzero()[:, 1])
+    image.sum().backward()
+    assert not given.opacities.grad[~tiles.any(0)].any() and given.opacities.grad.any()
+
+
 def test_sparse_gradients_have_the_rows_that_are_shown():
     grads = []
     for sparse in (False, True):

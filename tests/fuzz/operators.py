@@ -37,6 +37,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     reach = [rects, counts, integers([[0, 2], [2, 5]])]
     numbered = torch.cat([ops.list_records(*reach)[0], integers([[1], [1], [2]])], 1)
     moments = ops.channel_moments(shown, values, picture, None, 0.99, True, False, False)[0]
+    shaped = torch.where(counts[:, None] > 0, splats, -torch.inf)
     wanted = [True, True, True, True, True, False, False, True, True]
     source = [splats, counts, *rows]
     sums = list(ops.rasterize_vjp(*scene, wanted, source))
@@ -65,8 +66,8 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
             [splats, values, instances, ranges, behind, height, width, 0.99, True],
         ),
         "channel_moments": (ops.channel_moments, [shown, values, picture, planes[1], 0.99, True, True, True]),
-        "describe": (ops.describe, [splats, depths, counts]),
-        "describe packed": (ops.describe, [splats, depths, counts, True]),
+        "describe": (ops.describe, [shaped, depths, counts, height, width]),
+        "describe packed": (ops.describe, [shaped, depths, counts, height, width, True]),
         "describe_vjp": (ops.describe_vjp, [splats, counts, moments]),
         "pinhole": (ops.pinhole, [torch.eye(4, device=device, dtype=dtype), rand(3, 3), height, width]),
         "blend_rows": (ops.blend_rows, [state, *planes, True]),

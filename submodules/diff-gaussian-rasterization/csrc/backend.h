@@ -70,8 +70,9 @@ template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
 template <class T>
 void describe(const Executor&, const DescribeInput<T>&, const Descriptions<T>&);
-// Writes the numbers of the splats that have tiles, ascending. Returns how many there are.
-int64_t list_shown(const Executor&, int64_t count, const int32_t* tile_counts, int64_t* rows);
+// Writes the numbers of the splats that are shown, ascending. Returns how many there are.
+template <class T>
+int64_t list_shown(const Executor&, const DescribeInput<T>&, int64_t* rows);
 template <class T>
 void describe_vjp(const Executor&, const DescribedInput<T>&, const DescribedGradient<T>&);
 template <class T>
@@ -108,7 +109,7 @@ void count_records(const Queue&, const RecordInput&, int32_t* counts);
 void list_records(const Queue&, const RecordInput&, const RecordLists<float>&);
 void sum_runs(const Queue&, const SumInput<float>&);
 void describe(const Queue&, const DescribeInput<float>&, const Descriptions<float>&);
-int64_t list_shown(const Queue&, int64_t count, const int32_t* tile_counts, int64_t* rows);
+int64_t list_shown(const Queue&, const DescribeInput<float>&, int64_t* rows);
 void describe_vjp(const Queue&, const DescribedInput<float>&, const DescribedGradient<float>&);
 // In float64 as well.
 template <class T>

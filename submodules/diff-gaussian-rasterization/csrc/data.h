@@ -77,6 +77,7 @@ struct Scene {
   Dilation<T> dilation = dilation_of<T>(kUsualDilation);
   T near = T(kUsualNear);     // culled at or below this depth in the view
   bool any_rotation = false;  // whether rotations have any length, as raw ones have
+  bool keeps_shapes = false;  // whether splats without tiles have all but their colour (Projected::splats)
 
   GS_HD Rays rays() const { return !on_rays ? kNoRays : lens.chart == Chart::kPinhole ? kPinholeRays : kLensRays; }
   // Rows of what is made of the Gaussians: a row for each, or for those of the listed blocks alone.
@@ -102,8 +103,10 @@ struct alignas(16) TileRecord {
 
 template <class T>
 struct Projected {
-  T* splats;  // (N, splat_row(rays)), Splat in math/splat.h or what derives from it; undefined where tile_counts is 0
-  T* depths;  // (N) infinite where tile_counts is 0, so that binning sorts those last
+  // (N, splat_row(rays)), Splat in math/splat.h or what derives from it. Where tile_counts is 0 it is undefined; or
+  // with Scene::keeps_shapes its colour is, and culled ones have a log2_opacity of -inf and nothing else.
+  T* splats;
+  T* depths;       // (N) infinite where tile_counts is 0, so that binning sorts those last
   int32_t* rects;  // (N, 4) tiles x0 y0 x1 y1, undefined where tile_counts is 0; null allowed if there are records
   int32_t* tile_counts;      // (N)
   int32_t* radii;            // (N)
@@ -343,8 +346,9 @@ struct DescribeInput {
   int64_t count;
   const int64_t* rows;
   int row;
-  const T *splats, *depths;
+  const T *splats, *depths;  // with Scene::keeps_shapes
   const int32_t* tile_counts;
+  Image image;
 };
 template <class T>
 struct Descriptions {

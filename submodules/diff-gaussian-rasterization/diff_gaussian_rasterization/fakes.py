@@ -113,7 +113,7 @@ def _(pose, intrinsics, height, width):
 
 
 @_fake("describe")
-def _(splats, depths, tile_counts, packed=False):
+def _(splats, depths, tile_counts, height, width, packed=False):
     count = library.get_ctx().new_dynamic_size() if packed else splats.shape[0]
     floats = (splats.new_empty((count, *row)) for row in ((2,), (), (3,), ()))
     listed = (count if packed else 0,)

@@ -192,11 +192,11 @@ def _project(call: Call, item: Item) -> _Projection:
     how = shared, train if depth is None else None, numbers, None
     splats, own, counts, _, *lists = projected(*how, *scene)
     if call.clip > 0:
-        radii = OPERATORS.describe(splats.detach(), own.detach(), counts)[0]
+        radii = OPERATORS.describe(splats.detach(), own.detach(), counts, *call.size)[0]
         opacities = torch.where((radii <= call.clip).all(1), 0, opacities)
         splats, own, counts, _, *lists = projected(*how, item.means, opacities, *scene[2:])
     depth = own if depth is None else depth
-    *notes, rows = described(shared, call.packed, splats, depth, counts)
+    *notes, rows = described(shared, call.size, call.packed, splats, depth, counts)
     shown = torch.cat(features, 1) if len(features) > 1 else features[0] if features else None
     colored, order = degree is not None, depth.detach()
     return _Projection(shared, splats, colored, shown, train, order, lists, counts, tuple(notes), rows)

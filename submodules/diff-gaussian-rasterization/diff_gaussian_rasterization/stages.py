@@ -34,10 +34,11 @@ class Blending(NamedTuple):
 class Shared:
     """What an image's stages tell each other during a backward pass."""
 
-    __slots__ = ("lengths", "moments", "sent", "task", "use_lengths")
+    __slots__ = ("lengths", "moments", "sent", "shown", "task", "use_lengths")
 
     def __init__(self) -> None:
         self.lengths: Tensor | None = None  # of absolute gradients, (N,)
+        self.shown: Tensor | None = None  # (N,) int32: not 0 of rows that get gradients beside those of the image
         self.use_lengths: Callable[[Tensor], None] | None = None
         self.task = self.moments = self.sent = None
 
@@ -82,6 +83,8 @@ class _Projected(Function):
         needed, saved = ctx.needs_input_grad, ctx.saved_tensors
         results, scene = [None] * len(needed), (*saved[:_TENSORS], *ctx.numbers)
         splats, tile_counts = saved[_TENSORS:]
+        if ctx.shared.shown is not None:
+            tile_counts, ctx.shared.shown = ctx.shared.shown, None
         source = splats, tile_counts, torch.zeros_like(splats) if moments is None else moments
         means, to_view = scene[0], scene[8].to(splats)[:3, 2]
         if needed[2]:
@@ -101,24 +104,25 @@ class _Projected(Function):
 
 
 class _Described(Function):
-    """Inputs: `Shared`, whether rows are packed, splats, depths, tile_counts.
+    """Inputs: `Shared`, height and width, whether rows are packed, splats that keep their shapes, depths, tile_counts.
 
     Results (1, N, ...), or of the rows that are shown: radii, means2d, depths, conics, opacities, tiles, then the rows.
     """
 
     @staticmethod
     def forward(
-        ctx: Any, shared: Shared, packed: bool, splats: Tensor, depths: Tensor, tile_counts: Tensor
-    ) -> tuple[Tensor | None, ...]:
+        ctx: Any, shared: Shared, size: tuple[int, int], packed: bool, splats: Tensor, depths: Tensor,
+        tile_counts: Tensor,
+    ) -> tuple[Tensor | None, ...]:  # fmt: skip
         with torch._C._AutoDispatchBelowAutograd():
-            *found, tiles, rows = OPERATORS.describe(splats, depths, tile_counts, packed)
+            *found, tiles, rows = OPERATORS.describe(splats, depths, tile_counts, *size, packed)
         if packed:
             found.append(tiles)
         else:
             found, rows = [values[None] for values in (*found, tile_counts)], None
         ctx.shared = shared
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(splats, tile_counts, rows)
+        ctx.save_for_backward(splats, tile_counts, rows, found[0])
         ctx.mark_non_differentiable(found[0], found[5])
         if packed:
             ctx.mark_non_differentiable(rows)
@@ -127,17 +131,21 @@ class _Described(Function):
     @staticmethod
     @first_order("rasterization")
     def backward(ctx: Any, _: Any, centers: Tensor, of_depth: Tensor, conics: Tensor, opacities: Tensor, *__) -> tuple:
-        splats, tile_counts, rows = ctx.saved_tensors
+        splats, tile_counts, rows, radii = ctx.saved_tensors
         moments, marks = ctx.shared.take()
         given, added = [centers, conics, opacities], None
-        if [None if values is None else (values.data_ptr(), values._version) for values in given] != marks:
+        same = [None if values is None else (values.data_ptr(), values._version) for values in given] == marks
+        if not same or of_depth is not None:
+            shown = (radii > 0).all(-1).int()
+            ctx.shared.shown = shown = _dense(shown, rows, splats)
+        if not same:
             sent = [0] * 3 if moments is None else _screen(splats, tile_counts, moments, rows)
             more = [(0 if got is None else got) - own for got, own in zip(given, sent, strict=True)]
             more = [_dense(part, rows, splats) if isinstance(part, Tensor) else part for part in more]
-            added = _moments(splats, tile_counts, *more)
+            added = _moments(splats, shown, *more)
         if of_depth is not None:
-            of_depth = torch.where(tile_counts > 0, _dense(of_depth, rows, splats), 0)
-        return None, None, added, of_depth, None
+            of_depth = torch.where(shown > 0, _dense(of_depth, rows, splats), 0)
+        return None, None, None, added, of_depth, None
 
 
 def _screen(splats: Tensor, tile_counts: Tensor, moments: Tensor, rows: Tensor | None) -> Sequence[Tensor]:
@@ -153,7 +161,7 @@ def _dense(packed: Tensor, rows: Tensor | None, splats: Tensor) -> Tensor:
     return packed.new_zeros(len(splats), *packed.shape[1:]).index_copy_(0, rows, packed)
 
 
-def _moments(splats: Tensor, tile_counts: Tensor, centers: Tensor, conics: Tensor, opacities: Tensor) -> Tensor | None:
+def _moments(splats: Tensor, shown: Tensor, centers: Tensor, conics: Tensor, opacities: Tensor) -> Tensor | None:
     """The moments of which these are the gradients; the way back of the operator `describe_vjp`. 0: none is given."""
     out = torch.zeros_like(splats)
     l11, l12, l22 = splats[:, 2].abs(), splats[:, 3], splats[:, 4]
@@ -166,7 +174,7 @@ def _moments(splats: Tensor, tile_counts: Tensor, centers: Tensor, conics: Tenso
         xx, xy, yy = -2 * conics[:, 0], -conics[:, 1], -2 * conics[:, 2]
         out[:, 3] = l11 * l11 * xx + 2 * l11 * l12 * xy + l12 * l12 * yy
         out[:, 4], out[:, 5] = l22 * (l11 * xy + l12 * yy), l22 * l22 * yy
-    return torch.where((tile_counts > 0)[:, None], out, 0)
+    return torch.where((shown > 0)[:, None], out, 0)
 
 
 class _Blended(Function):

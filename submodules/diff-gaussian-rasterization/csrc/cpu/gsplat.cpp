@@ -24,15 +24,17 @@ void pinhole(const Executor&, const T* pose, const T* intrinsics, Image image, c
   baseline::make_pinhole(pose, intrinsics, image, out);
 }
 
-int64_t list_shown(const Executor&, int64_t count, const int32_t* tile_counts, int64_t* rows) {
+template <class T>
+int64_t list_shown(const Executor&, const DescribeInput<T>& in, int64_t* rows) {
   int64_t shown = 0;
-  for (int64_t i = 0; i < count; ++i)
-    if (tile_counts[i] > 0) rows[shown++] = i;
+  for (int64_t i = 0; i < in.count; ++i)
+    if (baseline::extent_of(in, baseline::shape_of(in, i)).shown) rows[shown++] = i;
   return shown;
 }
 
 #define GS_INSTANTIATE(T)                                                                                \
   template void describe<T>(const Executor&, const DescribeInput<T>&, const Descriptions<T>&);           \
+  template int64_t list_shown<T>(const Executor&, const DescribeInput<T>&, int64_t*);                    \
   template void describe_vjp<T>(const Executor&, const DescribedInput<T>&, const DescribedGradient<T>&); \
   template void pinhole<T>(const Executor&, const T*, const T*, Image, const PinholeMatrices<T>&);
 GS_INSTANTIATE(float)

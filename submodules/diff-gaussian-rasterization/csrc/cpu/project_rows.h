@@ -34,6 +34,11 @@ void cull_all(int64_t count, const Projected<T>& out) {
   if (out.records) std::fill_n(out.records, count, TileRecord{});
 }
 
+template <class T>
+void cull_shapes(int64_t count, const Projected<T>& out) {
+  for (int64_t i = 0; i < count; ++i) out.splats[splat_row(out.rays) * i + kLog2Opacity] = T(-INFINITY);
+}
+
 // Most Gaussians of a trained scene lie outside of a view. This finds them without their shape, and lists the others.
 template <class T, class AnyCamera>
 int64_t list_inside(const Scene<T>& s, const AnyCamera& camera, int32_t* inside) {
@@ -62,9 +67,9 @@ struct ProjectedPack {
   T splats[Simd<T>::kLanes * kRow], depths[Simd<T>::kLanes];
   typename IntOf<T>::type radii[Simd<T>::kLanes], rects[4][Simd<T>::kLanes];
 
-  // Returns a bit for each Gaussian that is visible, unless it reaches no tile.
+  // Returns a bit for each Gaussian that is visible, unless it reaches no tile. shaped: also if it reaches none.
   template <class AnyCamera>
-  uint32_t project(const Scene<T>& s, const AnyCamera& camera, const Pack<T>& pack) {
+  uint32_t project(const Scene<T>& s, const AnyCamera& camera, const Pack<T>& pack, uint32_t& shaped) {
     using S = Simd<T>;
     using V = typename S::Vec;
     SceneLanes<T> row(s, pack);
@@ -75,8 +80,9 @@ struct ProjectedPack {
     std::memcpy(radii, &radius, sizeof radii);
     if (!any(visible)) return 0;
     const Rect<typename S::Mask> rect = rect_of(camera, splat, s.image);
+    if (s.keeps_shapes) shaped = S::bits(visible);
     visible &= rect.x1 > rect.x0;
-    if (!any(visible)) return 0;
+    if (!any(visible) && !shaped) return 0;
     V rest[kMostRest];
     row.read_colors(s, pack, rest);
     visible &= project_color(s, camera, row, rest, splat);
@@ -91,14 +97,14 @@ struct ProjectedPack {
 };
 
 template <class T, int kRays>
-void write_splat(const ProjectedPack<T, kRays>& pack, int lane, Image image, int32_t i, const Projected<T>& out) {
+bool write_splat(const ProjectedPack<T, kRays>& pack, int lane, Image image, int32_t i, const Projected<T>& out) {
   const auto& r = pack.rects;
   const TileRect rect = {int32_t(r[0][lane]), int32_t(r[1][lane]), int32_t(r[2][lane]), int32_t(r[3][lane])};
   SplatOf<T, kRays> splat;
   std::memcpy(&splat, pack.splats + pack.kRow * lane, sizeof splat);
   uint64_t mask;
   const int32_t count = list_tiles(splat, rect, image, out.table, mask, nullptr);
-  if (!count) return;
+  if (!count) return false;
   out.tile_counts[i] = count, out.depths[i] = pack.depths[lane];
   if (out.records)
     out.records[i] = {masked(rect) ? mask : uint64_t(count), uint16_t(rect.x0), uint16_t(rect.y0), uint16_t(rect.x1),
@@ -108,19 +114,24 @@ void write_splat(const ProjectedPack<T, kRays>& pack, int lane, Image image, int
     to[0] = rect.x0, to[1] = rect.y0, to[2] = rect.x1, to[3] = rect.y1;
   }
   std::memcpy(out.splats + pack.kRow * int64_t(i), &splat, sizeof splat);
+  return true;
 }
 
 template <class T, class AnyCamera>
 void project_block(const Scene<T>& s, const AnyCamera& camera, const Projected<T>& out) {
   int32_t inside[kProjectBlock];
   cull_all(s.count, out);
+  if (s.keeps_shapes) cull_shapes(s.count, out);
   for_packs<T>(inside, list_inside(s, camera, inside), [&](const Pack<T>& pack) {
     ProjectedPack<T, kOnRays<AnyCamera>> projected;
-    const uint32_t visible = projected.project(s, camera, pack);
+    uint32_t shaped = 0;
+    const uint32_t visible = projected.project(s, camera, pack, shaped);
     for (int lane = 0; lane < pack.count; ++lane) {
       const int32_t i = pack.row[lane];
       out.radii[i] = int32_t(projected.radii[lane]);
-      if (visible >> lane & 1) write_splat(projected, lane, s.image, i, out);
+      const bool listed = visible >> lane & 1 && write_splat(projected, lane, s.image, i, out);
+      if (!listed && shaped >> lane & 1)
+        std::copy_n(projected.splats + projected.kRow * lane, projected.kRow, out.splats + projected.kRow * int64_t(i));
     }
   });
 }

@@ -30,11 +30,11 @@ __global__ void __launch_bounds__(kThreads)
   if (i < in.count) baseline::describe_vjp_splat(in, out, i);
 }
 
-struct HasTiles {
-  const int32_t* tile_counts;
+struct IsShown {
+  DescribeInput<float> in;
   __host__ __device__ bool operator()(int64_t i) const {
 #ifdef __CUDA_ARCH__
-    return tile_counts[i] > 0;
+    return baseline::extent_of(in, baseline::shape_of(in, i)).shown;
 #endif
     return false;
   }
@@ -52,12 +52,12 @@ void describe(const Queue& queue, const DescribeInput<float>& in, const Descript
   if (in.count) launch(queue, "describe", describe_kernel, blocks_for(in.count, kThreads), kThreads, in, out);
 }
 
-int64_t list_shown(const Queue& queue, int64_t count, const int32_t* tile_counts, int64_t* rows) {
-  if (!count) return 0;
+int64_t list_shown(const Queue& queue, const DescribeInput<float>& in, int64_t* rows) {
+  if (!in.count) return 0;
   int64_t* shown = queue.array<int64_t>(1);
   const thrust::counting_iterator<int64_t> all(0);
   with_memory(queue, [&](void* memory, size_t& bytes) {
-    return cub::DeviceSelect::If(memory, bytes, all, rows, shown, count, HasTiles{tile_counts}, stream_of(queue));
+    return cub::DeviceSelect::If(memory, bytes, all, rows, shown, in.count, IsShown{in}, stream_of(queue));
   });
   return *HostNumbers<int64_t>(queue, shown, 1).wait();
 }

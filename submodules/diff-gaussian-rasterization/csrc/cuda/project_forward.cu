@@ -75,8 +75,9 @@ __global__ void __launch_bounds__(kThreads)
   out.depths[row] = count ? depth : INFINITY;
   // A shape with tiles may still have a colour that is not finite: then `count` is 0.
   if (out.records) out.records[row] = tile_record(rect, count, mask);
-  if (!count) return;
-  if (out.rects) reinterpret_cast<int4*>(out.rects)[row] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
+  if (s.keeps_shapes && !visible) out.splats[splat_row(s.rays()) * row + kLog2Opacity] = -INFINITY;
+  if (!count && !(s.keeps_shapes && visible)) return;
+  if (out.rects && count) reinterpret_cast<int4*>(out.rects)[row] = make_int4(rect.x0, rect.y0, rect.x1, rect.y1);
   store_splat(out.splats, row, splat);
 }
 

@@ -11,24 +11,50 @@ GS_ISA_BEGIN
 
 constexpr double kMostSigmas = 3.33;  // gsplat's bound of a radius
 
-// Writes row i, zeros where the splat has no tile.
+// What gsplat tests and tells of a splat: radii along x and y, px. They are 0 unless the box with these half sides
+// around its mean meets the image. Programs count views by them, so they do not depend on whether a pixel's centre is
+// reached.
+template <class T>
+struct Extent {
+  T x, y;
+  bool shown;
+};
+
+template <class T>
+GS_HD Splat<T> shape_of(const DescribeInput<T>& in, int64_t from) {
+  Splat<T> s = {};
+  T* const to[] = {&s.x, &s.y, &s.l11, &s.l12, &s.l22, &s.log2_opacity};
+  s.log2_opacity = in.splats[in.row * from + kLog2Opacity];
+  if (!(s.log2_opacity > T(kLog2MinAlpha))) return s;  // of culled ones there is nothing else
+  for (int k = 0; k < kLog2Opacity; ++k) *to[k] = in.splats[in.row * from + k];
+  return s;
+}
+
+template <class T>
+GS_HD Extent<T> extent_of(const DescribeInput<T>& in, const Splat<T>& s) {
+  const T level = T(2 * kLn2) * (s.log2_opacity - T(kLog2MinAlpha));
+  if (!(level > 0)) return {T(0), T(0), false};
+  const T sigmas = std::sqrt(level), reach = sigmas < T(kMostSigmas) ? sigmas : T(kMostSigmas), half = T(0.5);
+  const T l11 = std::abs(s.l11), width = std::sqrt(T(kHalfLog2e)), wide = std::hypot(1 / l11, s.l12 / (l11 * s.l22));
+  const T x = std::ceil(reach * (width * wide)), y = std::ceil(reach * (width / s.l22));
+  const bool across = s.x + half + x > 0 && s.x + half - x < T(in.image.width);
+  return {x, y, across && s.y + half + y > 0 && s.y + half - y < T(in.image.height)};
+}
+
+// Writes row i, zeros where the splat is not shown.
 template <class T>
 GS_HD void describe_splat(const DescribeInput<T>& in, const Descriptions<T>& out, int64_t i) {
-  Splat<T> s = {};
   const int64_t from = in.rows ? in.rows[i] : i;
-  const bool shown = in.tile_counts[from] > 0;
-  if (shown) {
-    T* const to[] = {&s.x, &s.y, &s.l11, &s.l12, &s.l22, &s.log2_opacity};
-    for (int k = 0; k < 6; ++k) *to[k] = in.splats[in.row * from + k];
-  }
-  const T l11 = std::abs(s.l11), half = T(0.5), per = T(1 / kHalfLog2e);
-  const T level = T(2 * kLn2) * (s.log2_opacity - T(kLog2MinAlpha));
-  const T sigmas = level > 0 ? std::sqrt(level) : T(0), reach = sigmas < T(kMostSigmas) ? sigmas : T(kMostSigmas);
-  const T width = std::sqrt(T(kHalfLog2e)), along = s.l12 / (l11 * s.l22), wide = std::hypot(1 / l11, along);
-  out.radii[2 * i] = shown ? int32_t(std::ceil(reach * (width * wide))) : 0;
-  out.radii[2 * i + 1] = shown ? int32_t(std::ceil(reach * (width / s.l22))) : 0;
+  Splat<T> s = shape_of(in, from);
+  const Extent<T> extent = extent_of(in, s);
+  const bool shown = extent.shown;
+  if (!shown) s = {};
+  const T l11 = std::abs(s.l11), half = T(0.5), per = T(1 / kHalfLog2e), depth = in.depths[from];
+  out.radii[2 * i] = shown ? int32_t(extent.x) : 0;
+  out.radii[2 * i + 1] = shown ? int32_t(extent.y) : 0;
   out.centers[2 * i] = shown ? s.x + half : T(0), out.centers[2 * i + 1] = shown ? s.y + half : T(0);
-  out.depths[i] = shown ? in.depths[from] : T(0);
+  // One without tiles has no depth for lists.
+  out.depths[i] = !shown ? T(0) : depth < T(INFINITY) ? depth : 1 / in.splats[in.row * from + kInverseDepth];
   out.conics[3 * i] = per * (l11 * l11), out.conics[3 * i + 1] = per * (l11 * s.l12);
   out.conics[3 * i + 2] = per * (s.l12 * s.l12 + s.l22 * s.l22);
   out.opacities[i] = shown ? std::exp2(s.log2_opacity) : T(0);

@@ -16,7 +16,7 @@ struct Splat {
   T r, g, b;
   T inverse_depth;  // 1 / view z
 };
-constexpr int kSplatValues = 10;
+constexpr int kSplatValues = 10, kLog2Opacity = 5, kInverseDepth = 9;
 
 // The left border of a tile, as seen from a splat. A splat that crosses a border of a panorama goes on at the other
 // one: it has a copy every `width` of the image, and a tile shows the nearest one.

@@ -839,6 +839,38 @@ void test_given_covariances_and_colors() {
   check_near(got, wanted, 2e-5);
 }
 
+// Splats without tiles keep their shapes where that is asked for, on every device the same ones; lists stay as they
+// are.
+void test_kept_shapes() {
+  using gs::baseline::kInverseDepth, gs::baseline::kLog2Opacity, gs::baseline::kSplatValues;
+  for (const gs::Chart chart : {gs::Chart::kPinhole, gs::Chart::kPerspective}) {
+    Parameters<float> p(500);
+    if (chart != gs::Chart::kPinhole) p.lens = distorted(chart, 60, 34, 17);
+    for (int64_t i = 0; i < p.count; ++i) p.opacities[i] = std::exp(-float(i % 7));
+    for (float& scale : p.scales) scale = std::exp(scale);
+    gs::Scene<float> scene = scene_of(p, {70, 33}, false);
+    scene.raw = false;
+    gs::emulation::Memory memory;
+    const auto plain = bin_scene<float>(memory.queue(), scene, {});
+    scene.keeps_shapes = true;
+    const auto kept = bin_scene<float>(memory.queue(), scene, {});
+    const auto cpu = bin_scene<float>(gs::serial_executor(), scene, {});
+    CHECK(kept->instances == plain->instances && kept->tile_counts == plain->tile_counts);
+    CHECK(kept->tile_counts == cpu->tile_counts);
+    int64_t shapes = 0, culled = 0;
+    for (int64_t i = 0; i < p.count; ++i) {
+      const float *got = &kept->splats[kSplatValues * i], *wanted = &cpu->splats[kSplatValues * i];
+      CHECK(std::isinf(got[kLog2Opacity]) == std::isinf(wanted[kLog2Opacity]));
+      const bool shaped = !std::isinf(got[kLog2Opacity]);
+      shapes += shaped && !kept->tile_counts[i], culled += !shaped;
+      for (int k = 0; shaped && k <= kLog2Opacity; ++k)
+        CHECK_NEAR(got[k], wanted[k], 1e-4 * (1 + std::abs(double(wanted[k]))));
+      if (shaped) CHECK_NEAR(got[kInverseDepth], wanted[kInverseDepth], 1e-5);
+    }
+    CHECK(shapes > 20 && culled > 20);
+  }
+}
+
 // The gradients of a camera's numbers, on an Executor or a Queue.
 std::vector<double> camera_gradient(const gs::Executor& executor, const gs::Scene<float>& scene) {
   const int64_t blocks = gs::sleep_blocks(scene.count), numbers = gs::GS_ISA::camera_numbers(scene);
@@ -951,5 +983,6 @@ int main() {
                          test_runs,
                          test_runs_that_do_not_fit,
                          test_given_covariances_and_colors,
+                         test_kept_shapes,
                          test_cameras});
 }

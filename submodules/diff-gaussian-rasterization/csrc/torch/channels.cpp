@@ -94,31 +94,27 @@ void on_device(const Tensor& like, const Run& run) {
   });
 }
 
-// Splats as programs for gsplat know them, zeros where they have no tile (math/gsplat.h); if packed those that have
-// tiles, and then also their tiles and their numbers.
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> describe_op(const Tensor& splats,
-                                                                               const Tensor& depths,
-                                                                               const Tensor& tile_counts, bool packed) {
+// Splats that keep their shapes as programs for gsplat know them, zeros where they are not shown (math/gsplat.h); if
+// packed those that are shown, and then also their tiles and their numbers.
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> describe_op(
+    const Tensor& splats, const Tensor& depths, const Tensor& tile_counts, int64_t height, int64_t width, bool packed) {
   check_splats(splats);
   const int64_t n = splats.size(0);
   check_tensor(depths, "depths", splats.scalar_type(), splats.device(), {n});
   check_counts(tile_counts, n, splats.device());
+  const gs::Image image = checked_image(height, width);
   const Tensor values = gs::packed(splats), from = gs::packed(depths), counts = gs::packed(tile_counts);
   Tensor rows = empty<int64_t>({packed ? n : 0}, splats);
   Tensor radii, centers, to, conics, opacities, tiles;
   on_device<false>(splats, [&](auto zero, const auto& where) {
     using T = decltype(zero);
-    const int64_t shown = packed ? list_shown(where, n, read<int32_t>(counts), write<int64_t>(rows)) : n;
+    gs::DescribeInput<T> in{n,    nullptr, int(splats.size(1)), read<T>(values), read<T>(from), read<int32_t>(counts),
+                            image};
+    const int64_t shown = in.count = packed ? list_shown(where, in, write<int64_t>(rows)) : n;
     radii = empty<int32_t>({shown, 2}, splats), centers = empty({shown, 2}, splats), to = empty({shown}, splats);
     conics = empty({shown, 3}, splats), opacities = empty({shown}, splats);
     tiles = empty<int32_t>({packed ? shown : 0}, splats);
-    if (packed) rows = torch::stable::narrow(rows, 0, 0, shown);
-    const gs::DescribeInput<T> in{shown,
-                                  packed ? read<int64_t>(rows) : nullptr,
-                                  int(splats.size(1)),
-                                  read<T>(values),
-                                  read<T>(from),
-                                  read<int32_t>(counts)};
+    if (packed) rows = torch::stable::narrow(rows, 0, 0, shown), in.rows = read<int64_t>(rows);
     describe(where, in,
              gs::Descriptions<T>{write<int32_t>(radii), write<T>(centers), write<T>(to), write<T>(conics),
                                  write<T>(opacities), packed ? write<int32_t>(tiles) : nullptr});
@@ -184,7 +180,8 @@ GS_OPERATORS(diff_gaussian_rasterization, m) {
       "gradient)",
       TORCH_BOX(&channel_moments_op));
   m.define(
-      "describe(Tensor splats, Tensor depths, Tensor tile_counts, bool packed=False) -> (Tensor radii, Tensor centers, "
+      "describe(Tensor splats, Tensor depths, Tensor tile_counts, int height, int width, bool packed=False) -> (Tensor "
+      "radii, Tensor centers, "
       "Tensor depths, Tensor conics, Tensor opacities, Tensor tiles, Tensor rows)",
       TORCH_BOX(&describe_op));
   m.define(

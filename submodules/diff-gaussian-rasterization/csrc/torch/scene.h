@@ -9,7 +9,8 @@
 
 // The Gaussians, of which some may be null; the view matrix and the full projection, both transposed, and the centre;
 // tan_x, tan_y and scale_modifier, perhaps the numbers of a gs::Lens, and perhaps dilation and near; height, width,
-// sh_degree, antialiasing, raw (2: rotations alone have any length), and perhaps whether Gaussians are seen on rays.
+// sh_degree, antialiasing, raw (2: rotations alone have any length, and shapes are kept), and perhaps whether Gaussians
+// are seen on rays.
 #define CAMERA_SCHEMA "float[] lens, int[] options"
 #define SCENE_SCHEMA                                                                                   \
   "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, " \
@@ -132,7 +133,8 @@ class SceneTensors {
             rays_,
             gs::dilation_of<T>(dilation_),
             T(near_),
-            any_rotation_};
+            any_rotation_,
+            keeps_shapes_};
   }
 
  private:
@@ -146,7 +148,7 @@ class SceneTensors {
   double tan_x_, tan_y_, scale_modifier_, dilation_ = gs::kUsualDilation, near_ = gs::kUsualNear;
   std::array<double, gs::kLensNumbers> lens_ = {};  // gs::Lens; a pinhole if it is not given
   int sh_degree_;
-  bool antialiasing_, raw_, any_rotation_, rays_;
+  bool antialiasing_, raw_, any_rotation_, keeps_shapes_, rays_;
   gs::Image image_;
 };
 
