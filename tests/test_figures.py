@@ -110,7 +110,7 @@ def test_psnr_against_size_has_a_line_for_sets_that_differ_in_their_last_word(tm
     runs += [runs[0] | {"seed": 1}, runs[0] | {"apart": True, "config": "x"}, runs[1] | {"final_iteration": None}]
     assert [file.name for file in draw_sizes(tmp_path, "attic", runs)] == ["attic_size.png"]
     (axes,) = drawn[0].axes
-    assert points(axes, "adc") == [[[900, 29.0], [2000, 30.0]]] and points(axes, "mcmc") == [[[1000, 29.5]]]
+    assert points(axes, "adc") == [[[0.9, 29.0], [2.0, 30.0]]] and points(axes, "mcmc") == [[[1.0, 29.5]]]
     assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["adc", "mcmc", "budget"]
     assert sum(len(line.get_xdata()) for line in axes.lines) == 5
     assert draw_sizes(tmp_path, "attic", runs[:1]) == draw_sizes(tmp_path, "attic", runs[-1:]) == []

@@ -1,13 +1,13 @@
 """Trainings with changed constants of the code, each in a process of its own."""
 
 import contextlib
+import functools
 import importlib
 import io
 import multiprocessing
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from splatting.files.json_files import read_json
 
 
 class Training(NamedTuple):
-    """Words for train.py, and constants to change before it starts: "module:name" and value."""
+    """Words for train.py, and what to change before it starts: "module:name" or "module:Class.name", and value."""
 
     words: tuple[str, ...]
     changes: Mapping[str, Any] = {}
@@ -36,7 +36,7 @@ def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> list
         for slot in slots:
             free.put(slot)
         with context.Pool(len(slots), maxtasksperchild=1) as pool:
-            found = pool.imap(partial(_train, gpus=free), trainings, chunksize=1)
+            found = pool.imap(functools.partial(_train, gpus=free), trainings, chunksize=1)
             records = list(tqdm(found, total=len(trainings), unit="training"))
             pool.close()
             pool.join()
@@ -53,8 +53,9 @@ def _train(training: Training, gpus: Any) -> dict[str, Any]:
     if (gpu := gpus.get()) is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)
     for name, value in training.changes.items():
-        module, attribute = name.split(":")
-        setattr(importlib.import_module(module), attribute, value)
+        module, _, path = name.partition(":")
+        *owners, attribute = path.split(".")
+        setattr(functools.reduce(getattr, owners, importlib.import_module(module)), attribute, value)
     try:
         with tempfile.TemporaryDirectory() as out, contextlib.redirect_stderr(io.StringIO()):
             fixed = "--eval", "--quiet", "--disable_viewer", "--no_last_checkpoint"

@@ -211,7 +211,8 @@ def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
         end = run["iterations"].get(str(run["final_iteration"]), {})
         if end.get("PSNR") is not None and end["gaussians"] and not run["apart"]:
             name = run["config"] or "no option set"
-            lines.setdefault((name.rpartition("-")[0] or name, run["seed"]), []).append((end["gaussians"], end["PSNR"]))
+            line = lines.setdefault((name.rpartition("-")[0] or name, run["seed"]), [])
+            line.append((end["gaussians"] / 1000, end["PSNR"]))
     names = list(dict.fromkeys(name for name, _ in lines))
 
     def draw(axes: Axes) -> None:
@@ -220,7 +221,7 @@ def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
             style = {"color": f"C{names.index(name) % 10}", "marker": "o", "markersize": 3.5, "linewidth": 1.2}
             _draw(axes, sorted(points), None if again else name, **style)
 
-    labels = "Gaussians trained", "PSNR of the test views (dB)"
+    labels = "thousands of Gaussians", "PSNR of the test views (dB)"
     several = lines and len({run["config"] for run in runs}) > 1
     return [_panel(folder / f"{scene}_size.png", scene, False, labels, draw)] if several else []
 
