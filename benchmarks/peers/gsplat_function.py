@@ -31,13 +31,10 @@ class Call:
         rows = [given["means"], given["rotations"], given["scales"].exp(), given["opacities"].sigmoid().flatten()]
         rows.append(torch.rand(len(rows[0]), channels, device=device, generator=generator))
         self.inputs = [values.detach().clone().requires_grad_() for values in rows]
-        camera = scene.settings(torch.float32)
-        width, height = camera.image_width, camera.image_height
-        focal = width / (2 * camera.tanfovx), height / (2 * camera.tanfovy)
-        K = torch.tensor([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]], device=device)
+        view, K, width, height = scene.pinhole()
         background = torch.zeros(1, channels, device=device)
         self._options = {"width": width, "height": height, "packed": packed, "backgrounds": background}
-        self._camera = camera.viewmatrix.T.contiguous()[None], K[None]
+        self._camera = view[None], K[None]
         self._gradient = torch.randn(1, height, width, channels, device=device, generator=generator)
         self._draw = function
 
@@ -78,7 +75,7 @@ def main() -> None:
     try:
         import gsplat
     except ImportError:
-        raise UserError("install gsplat 1.5.3, whose kernels are measured") from None
+        raise UserError("install gsplat 1.6, whose kernels are measured") from None
     print(f"{describe('cuda')}, gsplat {gsplat.__version__}", end="\n\n")
     times, differences = [], []
     for workload in args.workloads:

@@ -28,11 +28,8 @@ def images(scene: SplatScene) -> dict[str, Callable[[], Image]]:
     """What makes each way to draw a scene, by name."""
     import gsplat
 
-    given, camera = scene.parameters, scene.settings(torch.float32)
-    width, height = camera.image_width, camera.image_height
-    focal = width / (2 * camera.tanfovx), height / (2 * camera.tanfovy)
-    K = torch.tensor([[focal[0], 0, width / 2], [0, focal[1], height / 2], [0, 0, 1]], device=given["means"].device)
-    view, sh = camera.viewmatrix.T.contiguous(), torch.cat([given["sh_dc"], given["sh_rest"]], 1).contiguous()
+    given, (view, K, width, height) = scene.parameters, scene.pinhole()
+    sh = torch.cat([given["sh_dc"], given["sh_rest"]], 1).contiguous()
     quats = torch.nn.functional.normalize(given["rotations"])
     shape = quats, given["scales"].exp(), given["opacities"].sigmoid().flatten()
 
@@ -42,7 +39,7 @@ def images(scene: SplatScene) -> dict[str, Callable[[], Image]]:
 
     def by_rasterize() -> Image:
         zeros = torch.zeros_like(given["means"])
-        settings = camera._replace(bg=camera.bg * 0)
+        settings = scene.settings(torch.float32, bg=torch.zeros(3))
         return lambda: rasterize(means2d=zeros, settings=settings, raw=True, **given).color.permute(1, 2, 0)
 
     def by_higs(tile: int, compression: str) -> Callable[[], Image]:

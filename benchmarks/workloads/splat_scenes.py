@@ -66,6 +66,13 @@ class SplatScene:
         tensors = {k: v.to(dtype) for k, v in made._asdict().items() if isinstance(v, Tensor)}
         return on_device(made._replace(**tensors), self.parameters["means"].device)
 
+    def pinhole(self) -> tuple[Tensor, Tensor, int, int]:
+        """Its camera as gsplat takes one: view (4, 4), K (3, 3), width and height."""
+        made = self.settings(torch.float32)
+        focal = self.width / (2 * made.tanfovx), self.height / (2 * made.tanfovy)
+        K = [[focal[0], 0, self.width / 2], [0, focal[1], self.height / 2], [0, 0, 1]]
+        return made.viewmatrix.T.contiguous(), made.viewmatrix.new_tensor(K), self.width, self.height
+
 
 def settings(
     width: int,
