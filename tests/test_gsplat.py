@@ -344,6 +344,32 @@ def test_radii_tell_whether_a_box_around_the_mean_meets_the_image(device):
     assert not given.opacities.grad[~tiles.any(0)].any() and given.opacities.grad.any()
 
 
+@pytest.mark.parametrize("opacity", [1 / 255, 100.0])
+def test_what_has_a_tile_is_shown(opacity):
+    """Also where gsplat's box ends before it: of an opacity that is just visible, and of more than 1."""
+    gradients = []
+    for weight in (0.0, 1.0):
+        given = Inputs(4, count=500)
+        with torch.no_grad():
+            given.opacities.fill_(opacity)
+        image, _, meta = given.draw()
+        listed = meta["flatten_ids"]
+        assert len(listed) and 0 <= listed.min() and listed.max() < len(meta["gaussian_ids"])
+        assert (meta["opacities"] > 0).all() and (meta["tiles_per_gauss"] > 0).any()
+        (image.sum() + weight * meta["depths"].sum()).backward()
+        gradients.append(given.opacities.grad)
+    assert torch.equal(*gradients) and (gradients[0].any() or opacity < 1)
+
+
+def test_a_colour_that_is_not_finite_spoils_no_other_gradient():
+    given = Inputs(5, degree=2)
+    with torch.no_grad():
+        given.colors[0] = math.nan
+    image, _, meta = given.draw(packed=False)
+    (image.sum() + meta["means2d"].sum() + meta["depths"].sum()).backward()
+    assert not meta["radii"][:, 0].any() and given.means.grad[1:].isfinite().all() and given.means.grad[1:].any()
+
+
 def test_sparse_gradients_have_the_rows_that_are_shown():
     grads = []
     for sparse in (False, True):

@@ -186,10 +186,17 @@ def test_blurred_photos_are_named_whatever_they_show(sound, tmp_path):
         views.append(replace(view, image_path=path, image_name=path.name))
     info = read(sound)._replace(train_cameras=views)
     (found,) = of_blur(info, 100)
-    assert str(found).startswith("4 of 8 photos look blurred (1.png, 3.png, 5.png, 7.png); take them out")
+    text = "4 of the {} photos that were checked look blurred (1.png, 3.png, 5.png, 7.png)"
+    assert found.text == text.format(8)
     assert [*of_blur(info._replace(train_cameras=views[::2]), 100)] == [*of_blur(_with_photos(COLORS), 9)] == []
-    Image.new("RGB", (64, 48)).save(views[0].image_path)
-    assert len([*of_blur(info._replace(train_cameras=views[::2]), 100)]) == 0
+    black = [replace(views[0], image_path=tmp_path / "black.png", image_name=f"black{n}") for n in range(8)]
+    Image.new("RGB", (64, 48)).save(tmp_path / "black.png")
+    assert [*of_blur(info._replace(train_cameras=[*views[::2], *black]), 100)] == []
+    for view in views:
+        grey = np.asarray(Image.open(view.image_path).convert("L")).astype(np.uint16) * 257
+        Image.fromarray(grey).save(view.image_path)
+    (found,) = of_blur(info._replace(train_cameras=[*views, *black]), 100)
+    assert found.text == text.format(16)
 
 
 def test_sound_photos_are_passed():

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
@@ -204,14 +205,14 @@ def draw_curves(
 def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
     """Draw test PSNR against the number of Gaussians trained; return the file, none for fewer than two option sets.
 
-    Sets whose names agree up to the last hyphen, as adc-100k and adc-200k, are joined by a line for each seed.
+    Sets whose names agree but for a number at their end, as adc-100k and adc-1M, are joined by a line for each seed.
     """
     lines: dict[tuple[str, Any], list[Point]] = {}
     for run in runs:
         end = run["iterations"].get(str(run["final_iteration"]), {})
         if end.get("PSNR") is not None and end["gaussians"] and not run["apart"]:
             name = run["config"] or "no option set"
-            line = lines.setdefault((name.rpartition("-")[0] or name, run["seed"]), [])
+            line = lines.setdefault((re.sub(r"(?<=.)-[\d.]+[kM]?$", "", name), run["seed"]), [])
             line.append((end["gaussians"] / 1000, end["PSNR"]))
     names = list(dict.fromkeys(name for name, _ in lines))
 

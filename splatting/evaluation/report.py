@@ -42,9 +42,8 @@ _NUMBER = re.compile(r"[\d.,]*\d")
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
-Pictures = Mapping[
-    str, Mapping[str, Any]
-]  # by scene: paths of `cameras`, `curves`, `sizes`, `poses`, `masked`; `views`
+# By scene: paths of `cameras`, `curves`, `sizes`, `poses`, `masked`; `views`.
+Pictures = Mapping[str, Mapping[str, Any]]
 
 
 def make_report(

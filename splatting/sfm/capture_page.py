@@ -86,7 +86,7 @@ def _lines(report: _Data) -> list[tuple[str, bool]]:
 def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequence[str]) -> list[dict[str, Any]]:
     """Of each photo its name, problems and facts by title, those with problems first; `row` numbers them."""
     neighbours, against = neighbours_of(placed), set((report.get("tried") or [{}])[0].get("against", ()))
-    sharpness = np.median([look.sharpness for look in looks.values()] or [1])
+    sharpness = np.median([look.sharpness for look in looks.values() if np.isfinite(look.sharpness)] or [1])
     brightness = np.median([look.brightness for look in looks.values() if np.isfinite(look.brightness)] or [0])
     problems = {
         "left out: its matches contradict the others": against,
@@ -100,7 +100,7 @@ def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequ
             facts = {"points": placed[name]["points"], "neighbours": len(neighbours[name])}
         else:
             facts = {"matching photos": report["left_out"].get(name, {}).get("partners", 0)}
-        if look := looks.get(name):
+        if (look := looks.get(name)) and np.isfinite(look.sharpness):
             facts["sharpness"] = f"{look.sharpness / max(sharpness, 1e-9):.0%}"
         if look and np.isfinite(look.brightness):
             facts["brightness"] = f"{round(look.brightness - brightness, 1) + 0:+.1f}"  # 0 is added as it ends -0.0

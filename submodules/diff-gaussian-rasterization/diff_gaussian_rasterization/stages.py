@@ -136,8 +136,11 @@ class _Described(Function):
         given, added = [centers, conics, opacities], None
         same = [None if values is None else (values.data_ptr(), values._version) for values in given] == marks
         if not same or of_depth is not None:
-            shown = (radii > 0).all(-1).int()
-            ctx.shared.shown = shown = _dense(shown, rows, splats)
+            if rows is None:
+                shown = torch.maximum(tile_counts, radii[0].amin(-1))
+            else:
+                shown = tile_counts.index_fill(0, rows, 1)
+            ctx.shared.shown = shown
         if not same:
             sent = [0] * 3 if moments is None else _screen(splats, tile_counts, moments, rows)
             more = [(0 if got is None else got) - own for got, own in zip(given, sent, strict=True)]

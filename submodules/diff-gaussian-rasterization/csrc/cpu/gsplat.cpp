@@ -28,7 +28,7 @@ template <class T>
 int64_t list_shown(const Executor&, const DescribeInput<T>& in, int64_t* rows) {
   int64_t shown = 0;
   for (int64_t i = 0; i < in.count; ++i)
-    if (baseline::extent_of(in, baseline::shape_of(in, i)).shown) rows[shown++] = i;
+    if (baseline::extent_of(in, i, baseline::shape_of(in, i)).shown) rows[shown++] = i;
   return shown;
 }
 

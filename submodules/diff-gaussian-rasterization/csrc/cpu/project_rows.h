@@ -85,7 +85,9 @@ struct ProjectedPack {
     if (!any(visible) && !shaped) return 0;
     V rest[kMostRest];
     row.read_colors(s, pack, rest);
-    visible &= project_color(s, camera, row, rest, splat);
+    const typename S::Mask colored = project_color(s, camera, row, rest, splat);
+    visible &= colored;
+    if (shaped) shaped &= S::bits(colored);
     std::memcpy(rects, &rect, sizeof rects), S::store(depths, depth);
     V values[kRow];
     std::memcpy(values, &splat, sizeof values);

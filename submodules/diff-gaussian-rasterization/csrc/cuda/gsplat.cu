@@ -34,7 +34,7 @@ struct IsShown {
   DescribeInput<float> in;
   __host__ __device__ bool operator()(int64_t i) const {
 #ifdef __CUDA_ARCH__
-    return baseline::extent_of(in, baseline::shape_of(in, i)).shown;
+    return baseline::extent_of(in, i, baseline::shape_of(in, i)).shown;
 #endif
     return false;
   }

@@ -61,14 +61,15 @@ __global__ void __launch_bounds__(kThreads)
   // The coefficients of Gaussians that are likely seen arrive while the warp computes shapes.
   const bool likely = i < s.count && near_view(camera, to_view(camera, mean));
   fetch(likely);
-  const bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
+  bool visible = i < s.count && project_shape(s, camera, SceneRow<float>{s, i}, splat, depth, radius);
   TileRect rect = {0, 0, 0, 0};
   if (visible) rect = rect_of(camera, splat, s.image);
   fetch(rect.x1 > rect.x0);
   uint64_t mask;
   int32_t count = warp_count_tiles<std::is_same_v<AnyCamera, LensCamera<float>>>(splat, rect, s.image, out.table, mask);
   wait_for_rows();
-  if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat)) count = 0;
+  if (count && !project_color(s, camera, SceneRow<float>{s, i}, rest + threadIdx.x * kRest, splat))
+    count = 0, visible = false;
   if (row >= s.rows()) return;
   out.radii[row] = radius;
   out.tile_counts[row] = count;

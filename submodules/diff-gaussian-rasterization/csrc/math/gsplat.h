@@ -17,7 +17,7 @@ constexpr double kMostSigmas = 3.33;  // gsplat's bound of a radius
 template <class T>
 struct Extent {
   T x, y;
-  bool shown;
+  bool shown;  // also one that has tiles all the same: of an opacity of just 1/255, or of more than 1
 };
 
 template <class T>
@@ -25,20 +25,22 @@ GS_HD Splat<T> shape_of(const DescribeInput<T>& in, int64_t from) {
   Splat<T> s = {};
   T* const to[] = {&s.x, &s.y, &s.l11, &s.l12, &s.l22, &s.log2_opacity};
   s.log2_opacity = in.splats[in.row * from + kLog2Opacity];
-  if (!(s.log2_opacity > T(kLog2MinAlpha))) return s;  // of culled ones there is nothing else
+  if (!(s.log2_opacity > T(2 * kLog2MinAlpha))) return s;  // of culled ones there is nothing else
   for (int k = 0; k < kLog2Opacity; ++k) *to[k] = in.splats[in.row * from + k];
   return s;
 }
 
 template <class T>
-GS_HD Extent<T> extent_of(const DescribeInput<T>& in, const Splat<T>& s) {
+GS_HD Extent<T> extent_of(const DescribeInput<T>& in, int64_t from, const Splat<T>& s) {
+  const bool listed = in.tile_counts[from] > 0;
   const T level = T(2 * kLn2) * (s.log2_opacity - T(kLog2MinAlpha));
-  if (!(level > 0)) return {T(0), T(0), false};
+  if (!(level > 0)) return {T(0), T(0), listed};
   const T sigmas = std::sqrt(level), reach = sigmas < T(kMostSigmas) ? sigmas : T(kMostSigmas), half = T(0.5);
   const T l11 = std::abs(s.l11), width = std::sqrt(T(kHalfLog2e)), wide = std::hypot(1 / l11, s.l12 / (l11 * s.l22));
-  const T x = std::ceil(reach * (width * wide)), y = std::ceil(reach * (width / s.l22));
+  const T most = T(1 << 30), box_x = std::ceil(reach * (width * wide)), box_y = std::ceil(reach * (width / s.l22));
+  const T x = box_x < most ? box_x : most, y = box_y < most ? box_y : most;
   const bool across = s.x + half + x > 0 && s.x + half - x < T(in.image.width);
-  return {x, y, across && s.y + half + y > 0 && s.y + half - y < T(in.image.height)};
+  return {x, y, listed || (across && s.y + half + y > 0 && s.y + half - y < T(in.image.height))};
 }
 
 // Writes row i, zeros where the splat is not shown.
@@ -46,7 +48,7 @@ template <class T>
 GS_HD void describe_splat(const DescribeInput<T>& in, const Descriptions<T>& out, int64_t i) {
   const int64_t from = in.rows ? in.rows[i] : i;
   Splat<T> s = shape_of(in, from);
-  const Extent<T> extent = extent_of(in, s);
+  const Extent<T> extent = extent_of(in, from, s);
   const bool shown = extent.shown;
   if (!shown) s = {};
   const T l11 = std::abs(s.l11), half = T(0.5), per = T(1 / kHalfLog2e), depth = in.depths[from];
