@@ -354,7 +354,7 @@ def test_what_has_a_tile_is_shown(opacity):
             given.opacities.fill_(opacity)
         image, _, meta = given.draw()
         listed = meta["flatten_ids"]
-        assert len(listed) and 0 <= listed.min() and listed.max() < len(meta["gaussian_ids"])
+        assert len(listed) and listed.min() >= 0 and listed.max() < len(meta["gaussian_ids"])
         assert (meta["opacities"] > 0).all() and (meta["tiles_per_gauss"] > 0).any()
         (image.sum() + weight * meta["depths"].sum()).backward()
         gradients.append(given.opacities.grad)

@@ -76,7 +76,7 @@ def test_each_scene_fills_a_screen_and_nothing_overflows(tab, report, width, hei
     })"""
     assert max(tab.evaluate(lines)) < 2.5  # no cell is broken into three lines
     figures = tab.locator(".figures img").all()
-    assert len(figures) == 2 * 2 and min(figure.bounding_box()["width"] for figure in figures) > 330
+    assert len(figures) == 2 * 3 and min(figure.bounding_box()["width"] for figure in figures) > 330
 
 
 def test_the_option_sets_lie_side_by_side_for_the_same_view(tab, report):
