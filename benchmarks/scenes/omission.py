@@ -11,18 +11,11 @@ import statistics
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.harness.trainings import Training, train_all
 from utils.system_utils import run_cli
-
-
-class Omission(NamedTuple):
-    """What switches an omission off: words for train.py, and constants of the code."""
-
-    words: tuple[str, ...] = ()
-    changes: dict[str, Any] = {}
 
 
 def _all_bands_at_once(run: Any, iteration: int) -> int:
@@ -31,13 +24,14 @@ def _all_bands_at_once(run: Any, iteration: int) -> int:
 
 
 NOTHING = "nothing"
-OMISSIONS = {
-    NOTHING: Omission(),
-    "rows that sleep": Omission(changes={"scene.sleeping:MOST_SHARE": 0.0}),
-    "SH bands before their turn": Omission(changes={"splatting.training.run:Run._raises_degree": _all_bands_at_once}),
-    "Gaussians unseen at the end": Omission(("--keep_unseen",)),
-    "large photos of a short training": Omission(
-        changes={"splatting.parts.time_budget_schedule:PYRAMID": ((0.0, 1.0), (0.1, 1.0))}
+OMISSIONS = {  # what is left in, and by which words and changes
+    NOTHING: Training(()),
+    "rows that sleep": Training((), {"scene.sleeping:MOST_SHARE": 0.0}),
+    "SH bands before their turn": Training((), {"splatting.training.run:Run._raises_degree": _all_bands_at_once}),
+    "Gaussians unseen at the end": Training(("--keep_unseen",)),
+    # With --time_budget alone.
+    "large photos of a short training": Training(
+        (), {"splatting.parts.time_budget_schedule:PYRAMID": ((0.0, 1.0), (0.1, 1.0))}
     ),
 }
 COLUMNS = {  # heading: key of a record, digits

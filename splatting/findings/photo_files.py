@@ -34,9 +34,9 @@ _FEW = 0.25  # of the photos; where more have it, it is a background
 _WIDTH = 640  # pixels at which photos are compared, as sharpness depends on it
 _COARSE = 4  # pixels
 _DIRECTIONS = np.array([(0, 1), (1, 0), (1, 1), (1, -1)])
-_BLURRED = (
-    0.25  # of the third quartile; sharp photos have 0.41 and more, those that moved by 12 of 240 pixels 0.1 to 0.2
-)
+# Of the third quartile of a scene's sharpness. Sharp photos have 0.41 and more, those smeared over 12 of 240 pixels 0.1
+# to 0.2.
+_BLURRED = 0.25
 
 
 def of_duplicates(info: SceneInfo, halves: bool = False) -> Iterator[Finding]:
