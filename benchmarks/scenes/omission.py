@@ -76,19 +76,17 @@ def main() -> None:
     cut = words.index("--") if "--" in words else len(words)
     args = parser.parse_args(words[:cut])
     names = list(dict.fromkeys([NOTHING, *args.left_in]))
-    trainings = [
-        Training(("-s", scene, "--seed", str(seed), *words[cut + 1 :], *OMISSIONS[name].words), OMISSIONS[name].changes)
-        for scene in args.scenes
-        for seed in args.seeds
-        for name in names
-    ]
-    records = train_all(trainings, args.gpus)
     print(describe("cuda" if args.gpus else "cpu"))
-    each = len(names) * len(args.seeds)
-    for place, scene in enumerate(args.scenes):
+    for scene in args.scenes:  # an interrupted run keeps the tables before
+        trainings = [
+            Training(("-s", scene, "--seed", str(seed), *words[cut + 1 :], *left_in.words), left_in.changes)
+            for seed in args.seeds
+            for left_in in (OMISSIONS[name] for name in names)
+        ]
+        records = train_all(trainings, args.gpus)
         print(f"\n{Path(scene).name}\n")
-        part = records[place * each : (place + 1) * each]
-        print_table(["left in", *COLUMNS], rows_of(names, part))
+        print_table(["left in", *COLUMNS], rows_of(names, records))
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":
