@@ -41,10 +41,11 @@ endif
 
 install: $(EXTENSIONS:%=$(VENV)/.built-%)
 
+# Python compiles what is imported; pip would compile all of torch, which takes 20 seconds.
 $(VENV)/.requirements: requirements.txt requirements-dev.txt
 	@$(PYTHON) -c '$(CHECK_PYTHON)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements-dev.txt
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r requirements-dev.txt
 	@touch $@
 
 .SECONDEXPANSION:
@@ -167,7 +168,7 @@ docs: $(DOCS_VENV)/.requirements
 $(DOCS_VENV)/.requirements: requirements-docs.txt
 	@$(PYTHON) -c '$(CHECK_PYTHON)'
 	$(PYTHON) -m venv $(DOCS_VENV)
-	$(DOCS_VENV)/bin/pip install --quiet --disable-pip-version-check -r $<
+	$(DOCS_VENV)/bin/pip install --quiet --disable-pip-version-check --no-compile -r $<
 	@touch $@
 
 clean:

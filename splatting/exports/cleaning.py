@@ -21,7 +21,7 @@ from gaussian_renderer.blending import weighted_sums
 from gaussian_renderer.free_view import FRACTIONS, neighbours, views_between
 from gaussian_renderer.importance import change_without
 from gaussian_renderer.scored_views import ScoredViews
-from scene.cameras import Camera
+from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
 from splatting.camera_paths.without_scene import WithoutScene
@@ -105,7 +105,8 @@ class Cleaning:
         errors = [max(10 ** (-self.after[id(camera)] / 10), _EXACT) for camera in self._cameras]
         pairs = neighbours(self._cameras, 0)
         between = chain.from_iterable(views_between(self._cameras[i], self._cameras[j]) for i, j in pairs)
-        views = chain(zip(self._cameras, errors, strict=True), ((view, sum(errors) / len(errors)) for view in between))
+        coarse = ((_coarse(view), sum(errors) / len(errors)) for view in between)
+        views = chain(zip(self._cameras, errors, strict=True), coarse)
         count = len(errors) + len(FRACTIONS) * len(pairs)
         for camera, error in Bar(views, desc="Weighing Gaussians", total=count, unit="view", leave=False):
             black = gaussians.get_xyz.new_zeros(3)
@@ -113,6 +114,12 @@ class Cleaning:
             weights /= error * camera.image_width * camera.image_height
             found[self.keep] = torch.maximum(found[self.keep], weights)
         return found.nan_to_num(0.0)
+
+
+def _coarse(view: MiniCam) -> MiniCam:
+    """The view with half the pixels each way: shares of an image hardly depend on them, and take most of the time."""
+    view.image_width, view.image_height = (max(1, size // 2) for size in (view.image_width, view.image_height))
+    return view
 
 
 @torch.no_grad()
