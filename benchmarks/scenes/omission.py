@@ -76,12 +76,13 @@ def main() -> None:
     cut = words.index("--") if "--" in words else len(words)
     args = parser.parse_args(words[:cut])
     names = list(dict.fromkeys([NOTHING, *args.left_in]))
+    left_in = [OMISSIONS[name] for name in names]
     print(describe("cuda" if args.gpus else "cpu"))
     for scene in args.scenes:  # an interrupted run keeps the tables before
         trainings = [
-            Training(("-s", scene, "--seed", str(seed), *words[cut + 1 :], *left_in.words), left_in.changes)
+            Training(("-s", scene, "--seed", str(seed), *words[cut + 1 :], *one.words), one.changes)
             for seed in args.seeds
-            for left_in in (OMISSIONS[name] for name in names)
+            for one in left_in
         ]
         records = train_all(trainings, args.gpus)
         print(f"\n{Path(scene).name}\n")
