@@ -66,9 +66,9 @@ demo-plan:
 output/demo_scene: | install
 	$(BIN)/python -m splatting.demo.make_scene $@
 
-# More processes than cores, as some wait. test-foreign has the tests that are ignored.
+# More processes than cores, as some wait. test-foreign has the tests that are ignored. What takes long is named.
 PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal \
-          --ignore tests/test_exports_foreign.py
+          --durations 25 --durations-min 5 --ignore tests/test_exports_foreign.py
 test: install lint cpp-test-cpu
 	$(PYTEST) -m 'not browser and not slow'
 

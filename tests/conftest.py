@@ -1,10 +1,9 @@
-"""Fixtures that several test files share, and a limit to the time of a test."""
+"""Fixtures that several test files share."""
 
 import os
 import shutil
 import signal
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,9 +19,6 @@ from splatting.evaluation.error_curve import FIGURE
 # Tests run side by side, a process a core. Those about several threads set their number.
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of programs that a test starts
 torch.set_num_threads(1)
-
-MOST_SECONDS = 10.0  # of processors, for a test that is not marked slow: a busy machine needs three times as many
-HAS_GPU = torch.cuda.is_available()  # whose first calls take seconds
 
 
 @pytest.fixture(scope="session")
@@ -43,24 +39,6 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
             patch.setattr(torch.cuda, "is_available", lambda: False)
             patch.setattr(torch.cuda, "_cached_device_count", 0, raising=False)  # torch remembers what it saw first
         return (yield)
-
-
-def _seconds_of_processors() -> float:
-    """Of this process and of its children that have ended: others on the machine do not add to it."""
-    times = os.times()
-    return times.user + times.system + times.children_user + times.children_system
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
-    """A test that takes long is marked, so that `-m "not slow"` stays short."""
-    start, began = _seconds_of_processors(), time.perf_counter()
-    result = yield
-    # Seconds of a child count when it is waited for, which may be in a later, shorter test.
-    taken = min(_seconds_of_processors() - start, time.perf_counter() - began)
-    if taken > MOST_SECONDS and item.get_closest_marker("slow") is None and not HAS_GPU:
-        pytest.fail(f"took {taken:.1f} s of CPU time: make it faster, or mark it with @pytest.mark.slow", pytrace=False)
-    return result
 
 
 @pytest.fixture(scope="session", autouse=True)

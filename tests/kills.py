@@ -21,6 +21,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -61,10 +62,11 @@ def main() -> int:
         make_blender_scene(scene)
         points = np.random.default_rng(0).normal(size=(300, 3))  # a scene without points would start with 100,000
         write_point_cloud(scene / "points3d.ply", points, np.full((300, 3), 127, np.uint8))
-        kinds = [(words, *_undisturbed(scene, Path(folder, "undisturbed"), words)) for words in ((), PLANNED)]
+        undisturbed = cache(lambda words: _undisturbed(scene, Path(folder, "undisturbed"), words))
         while counts.total() < args.kills:
             shutil.rmtree(out, ignore_errors=True)
-            words, expected, seconds, writes = kinds[trials % 2]
+            words = ((), PLANNED)[trials % 2]
+            expected, seconds, writes = undisturbed(words)
             done = _trial(rng, scene, out, words, seconds, writes)
             counts.update(name.split()[0] for name in done)
             trials += 1

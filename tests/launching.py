@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from unittest import mock
 
 import torch.distributed.run as torchrun
+from torch.distributed.elastic.multiprocessing.api import PContext
 from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,7 +76,8 @@ def launch(logs: Path, fault: str, *options: str, size: int = 2, restarts: int =
             statuses.append(0)
 
     thread = threading.Thread(target=run, daemon=True)
-    with mock.patch.dict(os.environ, environment(**more), clear=True):
+    patience = mock.patch.object(PContext.close, "__defaults__", (None, 3))  # seconds, else 30
+    with patience, mock.patch.dict(os.environ, environment(**more), clear=True):
         os.chdir(logs.parent)
         try:
             thread.start()

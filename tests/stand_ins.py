@@ -1,6 +1,7 @@
 """Stand-ins for the programs that full_eval.py starts: they write the files of train.py, render.py and so on at once.
 
 `run` does so in this process. `python tests/stand_ins.py train.py ...` does so as a program, which can be interrupted.
+`run_here` runs the real programs in this process, which has imported torch: that takes longer than a short training.
 """
 
 import argparse
@@ -9,7 +10,9 @@ import os
 import signal
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
+from unittest import mock
 
 from PIL import Image
 
@@ -169,6 +172,15 @@ def run_as_programs(command: list[str], say: str = "", slot: Slot | None = None,
     """The same in a process of its own."""
     environment |= {"PYTHONPATH": str(Path(__file__).parents[1])}
     return run_child([sys.executable, __file__, Path(command[1]).name, *command[2:]], say, slot, **environment)
+
+
+def run_here(command: list[str], say: str = "", slot: Slot | None = None, **environment: str) -> Finished:
+    """What `run_child` returns for a real program that ends without an error; any other error is raised."""
+    start = time.perf_counter()
+    stdout = mock.patch.object(sys, "stdout", sys.stdout)  # training stamps it
+    with stdout, mock.patch.object(sys, "argv", command[1:]), mock.patch.dict(os.environ, environment):
+        import_module(Path(command[1]).stem).main()
+    return Finished(0, [], time.perf_counter() - start, 1.0, None)
 
 
 if __name__ == "__main__":

@@ -157,6 +157,7 @@ def test_runs_agree_with_the_oracle_and_are_reported(monkeypatch, capsys):
 def test_equal_letters_are_equal_bytes(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(hashes, "TRAININGS", {"default": "--iterations 2", "seed": "--iterations 2 --seed 1"})
     monkeypatch.setattr(hashes, "_SCENE", (3, 32, 24, 60, 0))
+    monkeypatch.setattr(hashes, "run_child", stand_ins.run_here)
     monkeypatch.setattr(sys, "argv", ["hashes", "--device", "cpu"])
     hashes.main()
     first = json.loads(capsys.readouterr().out)

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from stand_ins import run, run_as_programs
+from stand_ins import run, run_as_programs, run_here
 from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
@@ -541,15 +541,13 @@ def test_each_model_becomes_a_page_that_the_report_links(evaluate):
 
 
 @pytest.mark.slow
-def test_for_real(colmap_scene, tmp_path):
+def test_for_real(colmap_scene, tmp_path, monkeypatch):
     """The real train.py, render.py and metrics.py accept their options, and the report has their results."""
     out = tmp_path / "out"
-    words = ["--scenes", str(colmap_scene), "--output_path", str(out), "--iterations", "20"]
     # A proxy that refuses connections, so that LPIPS does not download its weights.
-    environment = os.environ | {"TORCH_HOME": os.devnull, "https_proxy": "http://127.0.0.1:9"}
-    done = subprocess.run([sys.executable, "full_eval.py", *words], cwd=ROOT, env=environment, capture_output=True,
-                          text=True, timeout=300)  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    monkeypatch.setenv("TORCH_HOME", os.devnull)
+    monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
+    full_eval.main(["--scenes", str(colmap_scene), "--output_path", str(out), "--iterations", "20"], run_here)
     (run,) = json.loads((out / "report.json").read_text())["runs"]
     scores = json.loads((out / "colmap_scene" / "results.json").read_text())["ours_20"]
     values = run["iterations"]["20"]

@@ -5,7 +5,6 @@ import json
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import pytest
@@ -72,9 +71,7 @@ def _tensors(path: Path) -> list[torch.Tensor]:
     ids=["kill", "bug", "memory", "hang"],
 )
 def test_a_fault_of_one_rank_ends_all(colmap_scene, tmp_path, fault, said):
-    began = time.monotonic()
-    done = launch_fault(colmap_scene, tmp_path, fault, "--iterations", "40", size=3 if fault == "kill 0 7" else 2)
-    assert time.monotonic() - began < 90  # torchrun kills a rank that does not end 30 seconds after a signal
+    done = launch_fault(colmap_scene, tmp_path, fault, "--iterations", "40")
     assert done.status != 0
     text = "".join(done.stderr)
     assert said.format(out=tmp_path / "out") in text and ("Traceback" in text) == fault.startswith("bug")
@@ -148,7 +145,7 @@ def test_ranks_with_other_code_are_refused(colmap_scene, tmp_path):
 
 
 def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
-    paced = ("--iterations", "3000", "--eval", "--time_budget", "5", "--test_iterations", "-1")
+    paced = ("--iterations", "3000", "--eval", "--time_budget", "2", "--test_iterations", "-1")
     given = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
     done = launch(tmp_path / "logs", "none 0 0", *given)
     assert done.status == 0 and done.errors == []
