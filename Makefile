@@ -35,6 +35,7 @@ sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name
 
 .PHONY: install demo test check test-aarch64 test-windows test-macos test-browser test-foreign lint format docs wheels gate
 .PHONY: clean cpp-test cpp-test-cpu demo-plan
+unexport PYTHONDONTWRITEBYTECODE  # else each of hundreds of processes compiles the same modules
 ifndef PARALLEL  # which C++ tests set
 .NOTPARALLEL:
 endif

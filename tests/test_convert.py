@@ -344,7 +344,7 @@ def test_panoramas_are_placed_and_taken_as_they_are(tmp_path):
 
 @pytest.mark.slow
 def test_fisheyes_are_placed_and_stay_as_they_are(tmp_path, capsys):
-    make_photos(tmp_path / "input", VIEWS, lens=FISHEYE)
+    make_photos(tmp_path / "input", 6, lens=FISHEYE)
     shots = sorted((tmp_path / "input").iterdir())
     words = ["-s", str(tmp_path), "--no_gpu", "--camera", FISHEYE.model]
 

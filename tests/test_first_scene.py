@@ -85,14 +85,14 @@ def _displayed(book: nbformat.NotebookNode, kind: str) -> list[str]:
 
 @pytest.mark.slow
 def test_the_demo_becomes_a_picture_and_a_page(executed, tmp_path):
-    book = executed(CODE=str(ROOT), OUT=str(tmp_path / "out"), SECONDS=2, DEMO_WIDTH=80)
+    book = executed(CODE=str(ROOT), OUT=str(tmp_path / "out"), SECONDS=2, DEMO_WIDTH=40)
     assert len(_displayed(book, "image/png")) == len(_displayed(book, "image/jpeg")) == 1
     frame, link = _displayed(book, "text/html")
     page = html.unescape(re.search(r'<iframe [^>]*srcdoc="([^"]*)"', frame)[1])
-    assert page == (tmp_path / "out/demo_80_model.html").read_text(encoding="utf-8")
-    assert "href='../out/demo_80_model.zip'" in link
-    with zipfile.ZipFile(tmp_path / "out/demo_80_model.zip") as archive:
-        names = {"demo_80_model.html", "demo_80_model.html.jpg", "point_cloud.ply", "error_vs_time.png"}
+    assert page == (tmp_path / "out/demo_40_model.html").read_text(encoding="utf-8")
+    assert "href='../out/demo_40_model.zip'" in link
+    with zipfile.ZipFile(tmp_path / "out/demo_40_model.zip") as archive:
+        names = {"demo_40_model.html", "demo_40_model.html.jpg", "point_cloud.ply", "error_vs_time.png"}
         assert set(archive.namelist()) == names and archive.testzip() is None
 
 

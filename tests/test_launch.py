@@ -145,10 +145,10 @@ def test_ranks_with_other_code_are_refused(colmap_scene, tmp_path):
 
 
 def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
-    paced = ("--iterations", "3000", "--eval", "--time_budget", "2", "--test_iterations", "-1")
+    paced = ("--iterations", "3000", "--eval", "--time_budget", "5", "--test_iterations", "-1")
     given = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "2", *paced]
     done = launch(tmp_path / "logs", "none 0 0", *given)
     assert done.status == 0 and done.errors == []
     schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())
-    assert schedule["ended"] == records[-1]["iteration"] > 20
+    assert schedule["ended"] == records[-1]["iteration"] > 5

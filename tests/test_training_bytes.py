@@ -33,7 +33,7 @@ import train
 from scene.readers.point_cloud import write_point_cloud
 from splatting.distributed.ranks import ranks
 from splatting.registry import PARTS, part_class, strategies
-from splatting.training.steps.graphs import Graphs
+from splatting.training.steps.graphs import _MOST_KINDS, Graphs
 from utils.system_utils import UserError
 
 Result = dict[str, bytes | list]
@@ -93,7 +93,9 @@ def test_fast_steps(scene, tmp_path, monkeypatch, take_as, plain, way, name):  #
     assert launches > 40
     assert Rerun.made[0].records >= 3  # tensors that density control has replaced are captured anew
     assert all(len({kind[-3:] for kind in known}) <= 1 for known in kinds)  # graphs of another phase go
-    assert len(set().union(*kinds)) == KINDS.get(name.removeprefix("asleep, "), 4)  # four SH degrees
+    found, wanted = len(set().union(*kinds)), KINDS.get(name.removeprefix("asleep, "), 4)  # four SH degrees
+    # Tensors that lie where others did keep the graphs of those, which may leave no room for another.
+    assert wanted - (max(map(len, kinds)) == _MOST_KINDS) <= found <= wanted
 
 
 @EVERY
