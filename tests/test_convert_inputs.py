@@ -160,7 +160,7 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
     assert sort_inputs(tmp_path, skip_unreadable=True).photos == ["1.jpg", "2.jpg", "3.jpg"]
 
 
-PLACES = 10
+PLACES = 8
 LATER = ("photo_03.png", "photo_06.png")
 
 

@@ -33,17 +33,27 @@ def run(*command: object) -> str:
     return done.stdout
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> SimpleNamespace:
-    """A scene, the model trained on it, and the output of train.py and render.py."""
-    folder = tmp_path_factory.mktemp("end_to_end")
+def _train(folder: Path) -> None:
+    """Make a scene, train a model on it, and keep what train.py and render.py print."""
     scene, model = folder / "scene", folder / "model"
     make_scene(scene, VIEWS, 120, 90, 3000, seed=0)
     before = folder_state(scene)
     training = run("train.py", "-s", scene, "-m", model, "--eval", "--iterations", ITERATIONS,
                    "--densify_from_iter", 100, "--test_iterations", 1, ITERATIONS)  # fmt: skip
-    rendering = run("render.py", "-m", model)
-    return SimpleNamespace(scene=scene, model=model, before=before, training=training, rendering=rendering)
+    said = {
+        "training": training,
+        "rendering": run("render.py", "-m", model),
+        "scene_as_before": before == folder_state(scene),
+    }
+    (folder / "said.json").write_text(json.dumps(said))
+
+
+@pytest.fixture(scope="module")
+def trained(once) -> SimpleNamespace:
+    """A scene, the model trained on it, the output of the programs, and whether the scene is as before."""
+    folder = once("end_to_end", _train)
+    said = json.loads((folder / "said.json").read_text())
+    return SimpleNamespace(scene=folder / "scene", model=folder / "model", **said)
 
 
 def test_training_leaves_the_files_of_the_contract_and_the_dataset_alone(trained):
@@ -51,7 +61,7 @@ def test_training_leaves_the_files_of_the_contract_and_the_dataset_alone(trained
     expected = {"cfg_args", "cameras.json", "input.ply", f"point_cloud/iteration_{ITERATIONS}/point_cloud.ply"}
     assert expected <= files
     assert not [name for name in files if ".tmp" in name]
-    assert folder_state(trained.scene) == trained.before
+    assert trained.scene_as_before
 
 
 def test_renders_are_numbered_and_stand_beside_their_ground_truth(trained):

@@ -1,11 +1,13 @@
 """Trainings with changed constants of the code, each in a process of its own."""
 
+import argparse
 import contextlib
 import functools
 import importlib
 import io
 import multiprocessing
 import os
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +24,16 @@ class Training(NamedTuple):
 
     words: tuple[str, ...]
     changes: Mapping[str, Any] = {}
+
+
+def arguments(parser: argparse.ArgumentParser, seeds: Sequence[int]) -> tuple[argparse.Namespace, list[str]]:
+    """Add scenes, --seeds and --gpus to a parser; what it then reads, and the words after -- for train.py."""
+    parser.add_argument("scenes", nargs="+", help="scenes with test views")
+    parser.add_argument("--seeds", type=int, nargs="+", default=seeds, help="default: %(default)s")
+    parser.add_argument("--gpus", type=int, nargs="+", help="one training at a time for each number; default: one")
+    words = sys.argv[1:]
+    cut = words.index("--") if "--" in words else len(words)
+    return parser.parse_args(words[:cut]), words[cut + 1 :]
 
 
 def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> list[dict[str, Any]]:

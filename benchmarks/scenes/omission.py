@@ -8,13 +8,12 @@ other row leaves one thing in; its numbers are medians of the differences from t
 
 import argparse
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.harness.measuring import describe, print_table
-from benchmarks.harness.trainings import Training, train_all
+from benchmarks.harness.trainings import Training, arguments, train_all
 from utils.system_utils import run_cli
 
 
@@ -68,26 +67,20 @@ def rows_of(names: Sequence[str], records: Sequence[dict[str, Any]]) -> list[lis
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scenes", nargs="+", help="scenes with test views")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="default: 0 1 2")
-    parser.add_argument("--gpus", type=int, nargs="+", help="one training at a time for each number; default: one")
     parser.add_argument("--left_in", nargs="+", choices=OMISSIONS, default=list(OMISSIONS), help="default: all")
-    words = sys.argv[1:]
-    cut = words.index("--") if "--" in words else len(words)
-    args = parser.parse_args(words[:cut])
+    args, words = arguments(parser, [0, 1, 2])
     names = list(dict.fromkeys([NOTHING, *args.left_in]))
     left_in = [OMISSIONS[name] for name in names]
     print(describe("cuda" if args.gpus else "cpu"))
     for scene in args.scenes:  # an interrupted run keeps the tables before
         trainings = [
-            Training(("-s", scene, "--seed", str(seed), *words[cut + 1 :], *one.words), one.changes)
+            Training(("-s", scene, "--seed", str(seed), *words, *one.words), one.changes)
             for seed in args.seeds
             for one in left_in
         ]
         records = train_all(trainings, args.gpus)
         print(f"\n{Path(scene).name}\n")
         print_table(["left in", *COLUMNS], rows_of(names, records))
-        sys.stdout.flush()
 
 
 if __name__ == "__main__":

@@ -9,13 +9,12 @@ GPU. Differences are between trainings of the same seed: mean and standard error
 import argparse
 import importlib
 import statistics
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from benchmarks.harness.measuring import describe, print_table
-from benchmarks.harness.trainings import Training, train_all
+from benchmarks.harness.trainings import Training, arguments, train_all
 from utils.system_utils import run_cli
 
 OPTIONS = (
@@ -37,9 +36,8 @@ ATTRIBUTES = {
 
 
 class Job(NamedTuple):
-    """A training: the scene, a constant and its factor ("" and 1: none is changed), and the seed."""
+    """A training: a constant and its factor ("" and 1: none is changed), and the seed."""
 
-    scene: str
     constant: str
     factor: float
     seed: int
@@ -61,9 +59,9 @@ def changed(constant: str, factor: float) -> float:
     return max(round(new), 1) if isinstance(value, int) else new
 
 
-def training_of(job: Job, words: Sequence[str]) -> Training:
+def training_of(job: Job, scene: str, words: Sequence[str]) -> Training:
     """The training of a job. words: of the command line."""
-    base = ("-s", job.scene, "--strategy", "budget", "--seed", str(job.seed), *words)
+    base = ("-s", scene, "--strategy", "budget", "--seed", str(job.seed), *words)
     if job.constant in OPTIONS:
         return Training((*base, f"--{job.constant}", str(changed(job.constant, job.factor))))
     if not job.constant:
@@ -71,40 +69,31 @@ def training_of(job: Job, words: Sequence[str]) -> Training:
     return Training(base, {f"{ATTRIBUTES[job.constant]}:{job.constant}": changed(job.constant, job.factor)})
 
 
-def table(jobs: Sequence[Job], found: dict[Job, float], seeds: Sequence[int], scenes: Sequence[str]) -> list[list[str]]:
-    """Rows of the table: a constant, its value, and for each scene what halving and doubling it changes."""
+def table(found: dict[Job, float], constants: Sequence[str], seeds: Sequence[int]) -> list[list[str]]:
+    """Rows of a scene's table: a constant, its value, and what halving and doubling it changes. found: test PSNR."""
 
-    def gain(scene: str, constant: str, factor: float) -> str:
-        pairs = [found[Job(scene, constant, factor, seed)] - found[Job(scene, "", 1, seed)] for seed in seeds]
+    def gain(constant: str, factor: float) -> str:
+        pairs = [found[Job(constant, factor, seed)] - found[Job("", 1, seed)] for seed in seeds]
         error = f" ± {statistics.stdev(pairs) / len(pairs) ** 0.5:.2f}" if len(pairs) > 1 else ""
         return f"{statistics.mean(pairs):+.2f}{error}"
 
-    constants = dict.fromkeys(job.constant for job in jobs if job.constant)
-    first = [f"{statistics.mean(found[Job(scene, '', 1, seed)] for seed in seeds):.2f} dB" for scene in scenes]
-    rows = [["none changed", "", *(cell for one in first for cell in (one, ""))]]
-    for constant in constants:
-        cells = [gain(scene, constant, factor) for scene in scenes for factor in (0.5, 2)]
-        rows.append([f"`{constant}`", f"{value_of(constant):g}", *cells])
-    return rows
+    rows = [["none changed", "", f"{statistics.mean(found[Job('', 1, seed)] for seed in seeds):.2f} dB", ""]]
+    return rows + [[f"`{one}`", f"{value_of(one):g}", gain(one, 0.5), gain(one, 2)] for one in constants]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("scenes", nargs="+", help="scenes with test views")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1], help="default: 0 1")
-    parser.add_argument("--gpus", type=int, nargs="+", help="one training at a time for each number; default: the CPU")
     parser.add_argument("--constants", nargs="+", default=[*OPTIONS, *ATTRIBUTES], help="default: all")
-    words = sys.argv[1:]
-    cut = words.index("--") if "--" in words else len(words)
-    args = parser.parse_args(words[:cut])
+    args, words = arguments(parser, [0, 1])
     changes = [("", 1.0), *((name, factor) for name in args.constants for factor in (0.5, 2.0))]
-    jobs = [Job(scene, *change, seed) for change in changes for scene in args.scenes for seed in args.seeds]
-    records = train_all([training_of(job, words[cut + 1 :]) for job in jobs], args.gpus)
-    found = {job: record["test_psnr"] for job, record in zip(jobs, records, strict=True)}
-    names = [Path(scene).name for scene in args.scenes]
-    print(describe("cuda" if args.gpus else "cpu"))
-    header = ["constant", "value", *(f"{name}: {what}" for name in names for what in ("halved", "doubled"))]
-    print_table(header, table(jobs, found, args.seeds, args.scenes))
+    jobs = [Job(*change, seed) for change in changes for seed in args.seeds]
+    print(describe("cuda" if args.gpus else "cpu"), flush=True)
+    for scene in args.scenes:
+        records = train_all([training_of(job, scene, words) for job in jobs], args.gpus)
+        found = {job: record["test_psnr"] for job, record in zip(jobs, records, strict=True)}
+        header = ["constant", "value", *(f"{Path(scene).name}: {what}" for what in ("halved", "doubled"))]
+        print()
+        print_table(header, table(found, args.constants, args.seeds))
 
 
 if __name__ == "__main__":
