@@ -151,4 +151,4 @@ def test_ranks_keep_the_pace_of_the_first(colmap_scene, tmp_path):
     assert done.status == 0 and done.errors == []
     schedule = json.loads((tmp_path / "out" / "schedule.json").read_text())
     records = json.loads((tmp_path / "out" / "train_log.json").read_text())
-    assert schedule["ended"] == records[-1]["iteration"] > 5
+    assert schedule["ended"] == records[-1]["iteration"] > 20
