@@ -37,6 +37,7 @@ from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.exposure import Exposures
 from scene.gaussians.table import trainable
 from scene.readers.info import CameraInfo, photo_names
+from splatting.deterministic.portable_math import exponential, root
 from splatting.files.json_files import read_json, write_json
 from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func
@@ -130,7 +131,7 @@ class PhotoAppearance(Exposures):
         row = self._row_of.index_select(0, self.index(name))
         found = {"photos": self.photo(name), "response": self._response(row)}
         found |= {kind: _row(self._read(kind), row) for kind in ("vignetting", "middle")}
-        return sum(_ALL[kind][2] * (numbers.square() + _SMALL**2).sqrt().sum() for kind, numbers in found.items())
+        return sum(_ALL[kind][2] * root(numbers.square() + _SMALL**2).sum() for kind, numbers in found.items())
 
     @torch.no_grad()
     def fitted(self, image: Tensor, target: Tensor, counts: Tensor, colmap_id: object) -> Tensor:
@@ -154,12 +155,12 @@ class PhotoAppearance(Exposures):
         """gains (3, 1, 1) of the channels in stops. row: of the camera; None: one that changes nothing."""
         gains = _LN2 * gains  # the last bit of torch.exp2 depends on the number of threads
         if row is None:
-            return image * torch.exp(gains)
+            return image * exponential(gains)
         right, down = _places(*image.shape[-2:], image.device)
         middle, falloff = (_row(self._read(kind), row) for kind in ("middle", "vignetting"))
         a, b = (_LN2 * falloff[..., None, None]).unbind(1)
         square = (right - middle[:1]).square()[None, :] + (down - middle[1:]).square()[:, None]
-        x = image * torch.exp(gains + square * (a + (3 * square - 1.5) * b))
+        x = image * exponential(gains + square * (a + (3 * square - 1.5) * b))
         rises = torch.softmax(self._response(row), 1)
         p, q = 3 * (rises[:, 0] - 1 / 3)[:, None, None], 3 * (1 / 3 - rises[:, 2])[:, None, None]
         s = x.clamp(0, 1)

@@ -20,6 +20,7 @@ from scene.point_depths import PointDepths
 from scene.readers.info import CameraInfo, SceneInfo, up_of
 from scene.readers.tracks import projected
 from scene.scene import Scene
+from splatting.deterministic.portable_math import root
 from utils.graphics_utils import BasicPointCloud
 from utils.image_utils import as_float
 from utils.system_utils import UserError
@@ -100,7 +101,7 @@ class Shell:
         """Put the sky's Gaussians back on the sphere, and make those smaller that a split could send away from it."""
         means, scales = gaussians.raw("xyz"), gaussians.raw("scaling")
         far, center = self.rows(means)[:, None], means.new_tensor(self.center)
-        factor = self.radius / self._distances2(means).sqrt()
+        factor = self.radius / root(self._distances2(means))
         means.copy_(torch.where(far, center + (means - center) * factor[:, None], means))
         largest = math.log(_WIDEST * self.radius)
         scales.copy_(torch.where(far, gaussians.raw_scaling(gaussians.log_scales().clamp_max(largest)), scales))
@@ -256,7 +257,7 @@ def _photo(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
     size = [max(side * ACROSS // camera.image_width, 1) for side in image.shape[1:]]
     cells, counts = (adaptive_avg_pool2d(values, size) for values in (as_float(image), counts.float()))
     mean, square = (avg_pool2d(values[None], 3, 1, 1, count_include_pad=False)[0] for values in (cells, cells**2))
-    smooth = (square - mean**2).clamp_min(0).mean(0).sqrt() < _SMOOTH
+    smooth = (square - mean**2).mean(0) < _SMOOTH**2
     counts, smooth = (values.cpu().numpy() for values in (counts[0] == 1, smooth))
     return _Photo(view, cells.permute(1, 2, 0).cpu().numpy(), counts, _near_points(view, points), smooth)
 
