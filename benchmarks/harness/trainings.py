@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,8 +36,8 @@ def arguments(parser: argparse.ArgumentParser, seeds: Sequence[int]) -> tuple[ar
     return parser.parse_args(words[:cut]), words[cut + 1 :]
 
 
-def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> list[dict[str, Any]]:
-    """Train with --eval, and return what `_train` does for each.
+def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> Iterator[dict[str, Any]]:
+    """Train with --eval, and yield what `_train` returns for each, in their order.
 
     gpus: one training at a time for each number; None: one after another, on the CPU or the only GPU.
     """
@@ -49,10 +49,9 @@ def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> list
             free.put(slot)
         with context.Pool(len(slots), maxtasksperchild=1) as pool:
             found = pool.imap(functools.partial(_train, gpus=free), trainings, chunksize=1)
-            records = list(tqdm(found, total=len(trainings), unit="training"))
+            yield from tqdm(found, total=len(trainings), unit="training")
             pool.close()
             pool.join()
-    return records
 
 
 def _train(training: Training, gpus: Any) -> dict[str, Any]:

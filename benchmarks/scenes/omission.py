@@ -78,7 +78,7 @@ def main() -> None:
             for seed in args.seeds
             for one in left_in
         ]
-        records = train_all(trainings, args.gpus)
+        records = list(train_all(trainings, args.gpus))
         print(f"\n{Path(scene).name}\n")
         print_table(["left in", *COLUMNS], rows_of(names, records))
 

@@ -89,11 +89,17 @@ def main() -> None:
     jobs = [Job(*change, seed) for change in changes for seed in args.seeds]
     print(describe("cuda" if args.gpus else "cpu"), flush=True)
     for scene in args.scenes:
-        records = train_all([training_of(job, scene, words) for job in jobs], args.gpus)
-        found = {job: record["test_psnr"] for job, record in zip(jobs, records, strict=True)}
         header = ["constant", "value", *(f"{Path(scene).name}: {what}" for what in ("halved", "doubled"))]
-        print()
-        print_table(header, table(found, args.constants, args.seeds))
+        found: dict[Job, float] = {}
+        try:
+            records = train_all([training_of(job, scene, words) for job in jobs], args.gpus)
+            for job, record in zip(jobs, records, strict=True):
+                found[job] = record["test_psnr"]
+        finally:  # an interrupted run keeps what it knows
+            known = [one for one in args.constants if {job for job in jobs if job.constant == one} <= found.keys()]
+            if known:
+                print()
+                print_table(header, table(found, known, args.seeds))
 
 
 if __name__ == "__main__":
