@@ -16,7 +16,7 @@ import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from scene.sleeping import Sleeping
-from splatting.parts import filter_3d
+from splatting.parts import filter_3d, sky_shell
 from splatting.parts import robust_mask_residuals as residuals
 from splatting.training import loop, run
 from splatting.training.iteration import Iteration
@@ -126,6 +126,7 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
         patch.setattr(residuals.Residuals, "early", 0)  # renders are far from the photos
         patch.setattr(residuals, "_FACTOR", 1.2)
         patch.setattr(residuals, "_BESIDE", 0.4)
+        patch.setattr(sky_shell, "FEWEST", -1)  # --sky adds one in any scene
         train_on(scene, out, *words, "--no_curve", "--quiet", "--disable_viewer", *options)
     return whole_result(out, ITERATIONS)
 

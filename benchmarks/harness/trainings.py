@@ -9,7 +9,7 @@ import multiprocessing
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,7 +36,7 @@ def arguments(parser: argparse.ArgumentParser, seeds: Sequence[int]) -> tuple[ar
     return parser.parse_args(words[:cut]), words[cut + 1 :]
 
 
-def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> Iterator[dict[str, Any]]:
+def train_all(trainings: Sequence[Training], gpus: Sequence[int] | None) -> Generator[dict[str, Any], None, None]:
     """Train with --eval, and yield what `_train` returns for each, in their order.
 
     gpus: one training at a time for each number; None: one after another, on the CPU or the only GPU.

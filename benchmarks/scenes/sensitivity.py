@@ -7,6 +7,7 @@ GPU. Differences are between trainings of the same seed: mean and standard error
 """
 
 import argparse
+import contextlib
 import importlib
 import statistics
 from collections.abc import Sequence
@@ -91,10 +92,11 @@ def main() -> None:
     for scene in args.scenes:
         header = ["constant", "value", *(f"{Path(scene).name}: {what}" for what in ("halved", "doubled"))]
         found: dict[Job, float] = {}
+        trainings = [training_of(job, scene, words) for job in jobs]
         try:
-            records = train_all([training_of(job, scene, words) for job in jobs], args.gpus)
-            for job, record in zip(jobs, records, strict=True):
-                found[job] = record["test_psnr"]
+            with contextlib.closing(train_all(trainings, args.gpus)) as records:
+                for job, record in zip(jobs, records, strict=True):
+                    found[job] = record["test_psnr"]
         finally:  # an interrupted run keeps what it knows
             known = [one for one in args.constants if {job for job in jobs if job.constant == one} <= found.keys()]
             if known:

@@ -1,8 +1,9 @@
-"""Functions from operations that IEEE 754 rounds in one way only (csrc/math/portable.h).
+"""Functions that give the same bits on every CPU, with any number of threads.
 
 torch's functions differ in their last bits between vector body and scalar tail, so also between numbers of threads, and
-between devices. On a CPU torch's exp, log, square root and products of matrices are MKL's, which takes other code on a
-processor by Intel than on one by AMD. Values that enter the model must not differ.
+between devices. In torch for x86, exp, log, square root and products of matrices are MKL's, which takes other code on a
+processor by Intel than on one by AMD. Values that enter the model must not differ. `exp` and `log` use operations that
+IEEE 754 rounds in one way only (csrc/math/portable.h), on a GPU too, and have no derivatives.
 """
 
 from collections.abc import Callable
@@ -15,25 +16,24 @@ from torch import Tensor
 
 
 def exp(x: Tensor) -> Tensor:
-    """e^x in float64 to a few units in the last place, |x| <= 700 (clamped). `x` of any floating type."""
+    """e^x in float64 to a few units in the last place, |x| <= 700 (clamped). `x`: any floating type. No derivative."""
     return OPERATORS.exp(x.to(torch.float64))
 
 
 def log(x: Tensor) -> Tensor:
-    """Natural logarithm of positive finite float64 numbers, to 1e-15 relative to max(1, |result|)."""
+    """Natural logarithm of positive finite float64 numbers, to 1e-15 relative to max(1, |result|). No derivative."""
     return OPERATORS.log(x)
 
 
 def exponential(x: Tensor) -> Tensor:
-    """e^x in the type of `x`, differentiable. The same bits on all CPUs; a GPU has its own."""
+    """e^x in the type of `x`, differentiable. A GPU has bits of its own."""
     return _Differentiable.apply(x, lambda x: torch.exp(x) if x.is_cuda else exp(x).to(x.dtype), torch.mul)
 
 
 def root(x: Tensor) -> Tensor:
-    """The square root of float32 numbers, differentiable.
+    """The correctly rounded square root of float32 numbers, differentiable; on a GPU, too.
 
-    It is rounded rightly on every device, as float64 has more than twice the digits (Figueroa 1995, When is double
-    rounding innocuous?), and MKL's error there is below a unit in the last place.
+    No such root is nearer than 4 units of float64 to the middle of two float32 numbers, and MKL errs by less than one.
     """
     return _Differentiable.apply(x, lambda x: x.double().sqrt().to(x.dtype), lambda g, y: g / (2 * y))
 

@@ -51,8 +51,7 @@ def tell_if_slow(count: int, sh_degree: int) -> None:
     if sh_degree and minutes:
         print(
             f"{PROGRAM} takes about {minutes:,} min for the SH bands of {count:,} Gaussians, as it compares them "
-            "with each other, on the CPU, so that files repeat; --sh_degree 0 or a .spz takes seconds, and so does "
-            f"{PROGRAM} MODEL.ply MODEL.sog on a GPU",
+            "with each other, on the CPU, so that files repeat; --sh_degree 0 or a .spz takes seconds",
             file=sys.stderr,
         )
 
