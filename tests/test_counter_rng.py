@@ -92,7 +92,7 @@ def test_portable_functions_agree_with_numpy():
     assert np.abs(sin.numpy() - np.sin(angle)).max() < 2e-15
 
 
-def test_roots_and_exponentials_of_float32_are_rounded_rightly_and_have_derivatives():
+def test_roots_and_exponentials_of_float32_are_correctly_rounded_and_have_derivatives():
     x = torch.cat([torch.arange(1, 2**20).float(), torch.logspace(-37, 38, 200_001)])
     assert np.array_equal(portable_math.root(x).numpy(), np.sqrt(x.numpy()))
     y = torch.linspace(-87, 88, 200_001)
