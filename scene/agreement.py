@@ -15,12 +15,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
+from scene.rotation_only import rotation_error
+from scene.unmatched import cover, overlaps, places_of
+
 FEWEST = 15  # matches of a pair that is asked
 WORSE = 2.5  # times a pair's own error, beyond which it contradicts,
 FLOOR = 5e-4  # if that is also this share of the photo's longer side
 _BEHIND = 0.7  # share of a pair's matches behind a photo, from which it contradicts; without parallax it is a half
 _HEARD = 100  # matches of a pair that count; or two photos that show nearly the same would outvote all others
 _SHARING = 10  # other photos of a photo, whose tracks are compared
+_NAMED = 3  # pairs of photos that show different things
 _ROUNDS = 3  # of reweighted least squares
 # Other pairs' focal lengths are not known well enough, or they show nothing of depth (COLMAP's configurations).
 _CALIBRATED = {
@@ -56,9 +60,18 @@ class Pair(NamedTuple):
 def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
     """Judge a model by the verified pairs of a database whose focal lengths are calibrated; the result is JSON.
 
-    It is `verdict`, with bound: the number of photos that pairs join to one another, those without a pose, too.
+    It is `verdict` with what pairs alone do not say. bound: the number of photos that pairs join to one another, those
+    without a pose, too. rotation: rotation_error. alike: photos without which none stands where it shows other things
+    than its neighbours. alike_pairs: the clearest pairs of these.
     """
-    return verdict(list(pairs_of(model, database))) | {"bound": len(joined(_linked(database)))}
+    compared = sorted(overlaps(model, database), key=lambda pair: -pair.empty)
+    alike = [pair[:2] for pair in compared if pair.is_unmatched]
+    return verdict(list(pairs_of(model, database))) | {
+        "bound": len(joined(_linked(database))),
+        "rotation": rotation_error(database),
+        "alike": cover(alike),
+        "alike_pairs": alike[:_NAMED],
+    }
 
 
 def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
@@ -236,8 +249,7 @@ def _vote(pair: Pair) -> float:
 
 
 def _rays(camera: pycolmap.Camera, keypoints: Any) -> np.ndarray:
-    places = np.asarray(getattr(keypoints, "data", keypoints), float)[:, :2]
-    rays = np.asarray(camera.cam_ray_from_img(places), float).reshape(-1, 3)
+    rays = np.asarray(camera.cam_ray_from_img(places_of(keypoints)), float).reshape(-1, 3)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 

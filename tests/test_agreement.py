@@ -144,6 +144,45 @@ def test_pairs_of_a_database_judge_a_model(tmp_path):
     assert found["against"] == ["05.jpg"]
 
 
+def _mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: dict[str, int], **found: object) -> tuple:
+    """Map photos in ways that end with that many agreeing photos; return the ways, the judgements, the photos left out.
+
+    found: what the judgement finds besides.
+    """
+    work, done, left_out = tmp_path / "distorted", [], []
+    layout = SimpleNamespace(
+        database=work / "a.db", calibrated=work / "b.db", tried=work / "tried", models=work / "sparse", work=work,
+        judged=work / "judged.json",
+    )  # fmt: skip
+    work.mkdir()
+    backend = SimpleNamespace(
+        layout=layout, settings=SimpleNamespace(mapper="auto"), ways=("global", "simple", "incremental", "free"),
+        calibration=lambda: [], mapping=lambda way, models: [(way, models)],
+    )  # fmt: skip
+
+    def place(_: str, commands: list[tuple[str, Path]]) -> None:
+        ((way, models),) = commands
+        done.append(way)
+        if way not in agreeing:
+            raise UserError("no such way")
+        (models / "0").mkdir(parents=True)
+        (models / "0" / way).touch()
+
+    def run(commands: list, title: str) -> None:
+        if title == "Judging":
+            right = {"folder": "0", "pairs": 99, "agreeing": agreeing[done[-1]], "contradicting": 0.01, "against": []}
+            (work / "judging.json").write_text(json.dumps(right | {"error": 0.1, "own_error": 0.1} | found))
+        elif title == "Leaving out photos":
+            left_out.extend(json.loads(Path(commands[0][2]).read_text())["left_out"])
+
+    monkeypatch.setattr(mapping, "copy_database", lambda *_: None)
+    monkeypatch.setattr(mapping, "count_rows", lambda *_: found["photos"])
+    mapping.map_photos(backend, run, place)
+    judged = json.loads(layout.judged.read_text())
+    assert (layout.models / "0" / judged[0]["way"]).is_file() and not layout.tried.exists()
+    return done, judged, left_out
+
+
 @pytest.mark.parametrize(
     ("count", "agreeing", "tried", "kept"),
     [
@@ -156,40 +195,23 @@ def test_pairs_of_a_database_judge_a_model(tmp_path):
     ],
 )  # fmt: skip
 def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, tried, kept):
-    work, done = tmp_path / "distorted", []
-    layout = SimpleNamespace(
-        database=work / "a.db", calibrated=work / "b.db", tried=work / "tried", models=work / "sparse", work=work,
-        judged=work / "judged.json",
-    )  # fmt: skip
-    work.mkdir()
-    settings = SimpleNamespace(mapper="auto")
-    backend = SimpleNamespace(
-        layout=layout, settings=settings, ways=("global", "simple", "incremental", "free"), calibration=lambda: [],
-        mapping=lambda way, models: [(way, models)],
-    )  # fmt: skip
-
-    def place(_: str, commands: list[tuple[str, Path]]) -> None:
-        ((way, models),) = commands
-        done.append(way)
-        if way not in agreeing:
-            raise UserError("no such way")
-        (models / "0").mkdir(parents=True)
-        (models / "0" / way).touch()
-
-    def run(_: list, title: str) -> None:
-        if title == "Judging":
-            agree = agreeing[done[-1]]
-            found = {"folder": "0", "photos": count, "pairs": 99, "agreeing": agree, "bound": count}
-            found |= {"contradicting": 0.01, "against": [], "error": 0.1, "own_error": 0.1}
-            (work / "judging.json").write_text(json.dumps(found))
-
-    monkeypatch.setattr(mapping, "copy_database", lambda *_: None)
-    monkeypatch.setattr(mapping, "count_rows", lambda *_: count)
-    mapping.map_photos(backend, run, place)
-    assert done == tried and (layout.models / "0" / kept).is_file() and not layout.tried.exists()
-    judged = json.loads(layout.judged.read_text())
-    assert judged[0]["way"] == kept and len(judged) == len(tried)
+    done, judged, _ = _mapped(tmp_path, monkeypatch, agreeing, photos=count, bound=count)
+    assert done == tried and judged[0]["way"] == kept and len(judged) == len(tried)
     assert capsys.readouterr().out.count("; trying ") == len(tried) - 1
+
+
+@pytest.mark.parametrize(
+    ("found", "tried", "left_out"),
+    [
+        ({"alike": ["7.jpg"]}, 1, ["7.jpg"]),  # one photo among those of another thing is left out
+        ({"alike": ["7.jpg", "8.jpg", "9.jpg"], "alike_pairs": [["7.jpg", "1.jpg"]]}, 4, []),  # parts upon each other
+        ({"rotation": 0.002}, 1, []),  # no way places a camera that only turned
+    ],
+)
+def test_pairs_that_mislead(tmp_path, monkeypatch, found, tried, left_out):
+    agreeing = dict.fromkeys(("global", "simple", "incremental", "free"), 20)
+    done, judged, out = _mapped(tmp_path, monkeypatch, agreeing, photos=20, bound=20, **found)
+    assert len(done) == tried and out == left_out and is_wrong(judged[0]) == (not left_out)
 
 
 def test_when_a_model_is_called_wrong():

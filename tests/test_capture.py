@@ -109,7 +109,7 @@ def test_the_page_shows_what_is_wrong_with_each_photo(folder):
     cards = re.findall(r'<div id="photo\d+".*?<b>(.*?)</b>\n(.*?)</div>', text, re.S)
     assert [(name, re.findall('"problem">(.*?)<', card)) for name, card in cards] == [
         ("b.jpg", ["blurred"]), ("d.jpg", ["weakly connected"]), ("e&lt;&amp;.jpg", ["not placed"]),
-        ("f.jpg", ["left out: its matches contradict the others"]), ("a.jpg", []), ("c.jpg", []),
+        ("f.jpg", ["left out: too few other photos match it"]), ("a.jpg", []), ("c.jpg", []),
     ]  # fmt: skip
     assert "<dt>neighbours</dt><dd>2</dd>" in cards[0][1] and "<dt>matching photos</dt><dd>0</dd>" in cards[2][1]
     assert [re.findall("brightness</dt><dd>(.*?)<", card) for _, card in cards[1:5]] == [["-2.0"], [], [], ["+0.0"]]

@@ -1,5 +1,6 @@
-"""What the ray-traced sets of captures.py show, and from where: corridor, rooms, turntable, frames of a video."""
+"""The ray-traced sets of captures.py, things and cameras: sound captures, a video, and some that mislead matching."""
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +9,7 @@ from splatting.demo.objects import Box, Sphere, Thing, demo_scene, marble
 from splatting.demo.tracer import TARGET, View, look_at
 
 _DOOR, _DOORS, _WIDE, _HIGH = 2.0, 24, 1.2, 2.5  # of the corridor, in units; from the middle to a wall
+_APART = 100.0  # from one room with the poster to the other
 _MARKED = 4  # every so many doors have a mark beside them
 _ROOMS = Box((0, -1.25, 0), (2.5, 1.25, 2), 0), Box((5.5, -1.25, 0.2), (2.5, 1.25, 2.2), 0)
 _PASSAGE = Box((2.75, -1, 0), (0.5, 1, 0.5), 0)
@@ -158,7 +160,73 @@ def video_views(width: int, height: int) -> list[View]:
     return ring(300, width, height)
 
 
+def one_room(_: int | None = None) -> list[Thing]:
+    """A bare room with walls of one texture."""
+    return [Thing(_ROOMS[0], lambda p: grain(p, 4), emissive=True)]
+
+
+def turning_views(noise: float, width: int, height: int) -> list[View]:
+    """Eighteen cameras in the middle of the room that look around. noise: standard deviation of their places, units."""
+    rng, views = np.random.default_rng(5), []
+    for k in range(18):
+        center, turn = np.array([0.2, -1.3, 0.1]) + noise * rng.standard_normal(3), np.radians(20 * k)
+        target = center + [np.sin(turn), rng.uniform(-0.1, 0.1), np.cos(turn)]
+        views.append(View(look_at(center, target), center, 0.6 * width, width, height))
+    return views
+
+
+def poster(_: int | None = None) -> list[Thing]:
+    """Two rooms with walls of their own and the same poster on one wall each."""
+
+    def walls(p: np.ndarray, seed: int) -> np.ndarray:
+        on_poster = (p[2] > _ROOMS[0].half[2] - 1e-3) & (np.abs(p[0]) < 0.8) & (p[1] < -0.6) & (p[1] > -2.0)
+        return np.where(on_poster, grain(np.float32(1.5) * p, 8), grain(p, seed))
+
+    first, away = _ROOMS[0], np.float32([[_APART], [0], [0]])
+    second = Box((_APART, *first.center[1:]), first.half, 0)
+    return [
+        Thing(first, lambda p: walls(p, 4), emissive=True),
+        Thing(second, lambda p: walls(p - away, 6), emissive=True),
+    ]
+
+
+def poster_views(width: int, height: int) -> list[View]:
+    """Ten cameras in each room, which look at the poster and the walls beside it."""
+    rng, views = np.random.default_rng(6), []
+    for room in (0.0, _APART):
+        for k in range(10):
+            center = np.array([room - 1.6 + 0.35 * k, rng.uniform(-1.5, -1.1), rng.uniform(-1.2, -0.6)])
+            target = np.array([room + rng.uniform(-0.8, 0.8), -1.3, 2.0])
+            views.append(View(look_at(center, target), center, 0.7 * width, width, height))
+    return views
+
+
+def twin_box(_: int | None = None) -> list[Thing]:
+    """A box on black whose front and back are alike."""
+    half = 1.0, 0.8, 0.7
+
+    def faces(p: np.ndarray) -> np.ndarray:
+        on_end = np.abs(p[2]) > half[2] - 1e-3
+        same = np.stack([p[0] * np.sign(p[2]), p[1], np.abs(p[2])])
+        return grain(np.where(on_end, same, p), 9)
+
+    black = Thing(Sphere((0, 0, 0), 30.0, inside=True), np.zeros_like, emissive=True)
+    return [black, Thing(Box((0, 0, 0), half, 0), faces, emissive=True)]
+
+
+def twin_box_views(width: int, height: int) -> list[View]:
+    """Thirty-six cameras around the box."""
+    rng, views = np.random.default_rng(7), []
+    for angle in 2 * np.pi * np.arange(36) / 36:
+        center = np.array([4 * np.sin(angle), rng.uniform(-1.2, -0.4), 4 * np.cos(angle)])
+        views.append(View(look_at(center, np.zeros(3)), center, 1.1 * width, width, height))
+    return views
+
+
 TRACED = {
+    **{f"turning{round(100 * noise)}": (partial(turning_views, noise), one_room) for noise in (0.0, 0.01, 0.03, 0.3)},
+    "poster": (poster_views, poster),
+    "twin_box": (twin_box_views, twin_box),
     "corridor": (corridor_views, corridor),
     "rooms": (rooms_views, rooms),
     "turntable": (turntable_views, turntable),

@@ -28,6 +28,9 @@ REPORT = "convert_report.json"
 SHORT_TRACKS = 3.0  # views per point; with fewer, most points depend on a single pair
 LARGE_ERROR = 1.5, 1e-3  # pixels, and share of the longer side; a good model of sharp photos has 0.3 to 1 pixels
 CONTRADICTING = 0.1  # share of the matches; right models had 0.09 at most, wrong ones 0.04 to 0.97
+TURNED = 0.006  # of the longer side, rotation_error; in a room 0.004 with 3 cm of noise, right models 0.018 at least
+ALIKE = 0.05  # share of a model's photos that may stand among photos of other things, and are left out
+LONELY = 3  # matching photos of a photo, with which its place is not known well
 SOUND = 0.6  # share of a model's photos that have to agree, or it is called wrong
 OTHER_LENS = 0.02  # difference of a photo's own focal length from its camera's; those of one lens have 0.017 at most
 BETTER = 0.9  # of its error, that a photo of another lens falls below with a focal length of its own
@@ -82,7 +85,7 @@ def of_model(
     against = list(tried[0].get("against", ())) if tried else []
     out = sorted(set(images) - set(chosen.registered) - set(against))
     if tried:
-        yield from _of_judgement(tried[0], len(images))
+        yield from _of_judgement(tried[0], len(images), partners)
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
         text = f"{len(out)} of {len(images)} photos left out ({some(out)})"
@@ -107,9 +110,17 @@ def of_model(
         yield Finding(f"the mean reprojection error is {chosen.error:.1f} pixels", remedy)
 
 
-def _of_judgement(found: Mapping[str, Any], photos: int) -> Iterator[Finding]:
-    """What the matches say of the chosen model (mapping.py)."""
-    against = found.get("against", ())
+def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, int]) -> Iterator[Finding]:
+    """Findings of the matches about the chosen model (mapping.py). partners: matching photos of each photo."""
+    if only_turned(found):
+        text = "the camera turned in one place, as rotations alone explain the matches, so the depths are not known"
+        yield Finding(text, "walk, do not turn: take each photo some steps from the one before")
+        return
+    if is_folded(found):
+        pairs = " and ".join(f"{one} with {other}" for one, other in found["alike_pairs"])
+        text = f"parts of the scene look alike and are laid upon each other ({pairs} show different things)"
+        yield Finding(text, "take photos that lead from one part to the other, or convert each part by itself")
+        return
     if not found.get("pairs") and "failed" not in found:
         text = "the poses could not be judged, since no two photos have enough matches with known focal lengths"
         yield Finding(text, "look at capture.html, or take more photos that overlap")
@@ -118,17 +129,33 @@ def _of_judgement(found: Mapping[str, Any], photos: int) -> Iterator[Finding]:
         remedy = "if the photos came through several lenses, or are zoomed or cropped, use --cameras per_photo; else "
         remedy += "remove photos of other things, and take more that overlap"
         yield Finding(f"the poses contradict {matches}, so they are probably wrong", remedy)
-    if against:
+    lonely = [name for name in found.get("against", ()) if partners.get(name, 0) <= LONELY]
+    if against := sorted(set(found.get("against", ())) - set(lonely)):
         text = f"{len(against)} of {photos} photos left out ({some(against)}), since their matches contradict the"
         remedy = "if they came through another lens, or are zoomed or cropped, use --cameras per_photo; else remove "
         yield Finding(f"{text} others", f"{remedy}them, and take more there")
+    if lonely:
+        text = f"{len(lonely)} of {photos} photos left out ({some(lonely)}), since too few others match them"
+        yield Finding(text, f"take more there, {_OVERLAPPING}")
 
 
 def is_wrong(found: Mapping[str, Any]) -> bool:
-    """Whether a judged model is to be called wrong, although it is the best. One without pairs cannot be judged."""
+    """Tell a judged model that is wrong, although it is the best. One without pairs cannot be judged."""
     if not found.get("pairs"):
         return False
-    return found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
+    is_split = found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
+    return is_split or only_turned(found) or is_folded(found)
+
+
+def is_folded(found: Mapping[str, Any]) -> bool:
+    """Tell a judged model that lays parts which look alike upon each other."""
+    return len(found.get("alike", ())) > ALIKE * found.get("photos", 0)
+
+
+def only_turned(found: Mapping[str, Any]) -> bool:
+    """Tell a judged model of a camera that stood in one place."""
+    error = found.get("rotation")
+    return error is not None and error < TURNED
 
 
 def _is_large(model: "Model") -> bool:
@@ -255,6 +282,10 @@ def training_options(report: Mapping[str, Any]) -> str:
 def unusable(report: Mapping[str, Any]) -> str | None:
     """What to say where too few photos are placed, or where they contradict each other."""
     placed, count = report["registered"], report["photos"]
+    if report.get("tried") and only_turned(report["tried"][0]):
+        return "the camera turned in one place, so do not train on this scene; walk, do not turn"
+    if report.get("tried") and is_folded(report["tried"][0]):
+        return "parts that look alike are laid upon each other in it, so do not train on this scene"
     if report.get("tried") and is_wrong(report["tried"][0]):
         return "no way of mapping found poses that agree with the photos' matches, so do not train on this scene"
     if placed >= LEAST * count:

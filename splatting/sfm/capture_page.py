@@ -18,7 +18,16 @@ from scene.readers.info import from_above
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.json_files import read_json, write_json
-from splatting.findings.capture import Look, is_wrong, lines_of, neighbours_of, training_options, unusable, worth
+from splatting.findings.capture import (
+    LONELY,
+    Look,
+    is_wrong,
+    lines_of,
+    neighbours_of,
+    training_options,
+    unusable,
+    worth,
+)
 from splatting.host.machine import threads
 from splatting.sfm.capture import compared, looks_of
 from splatting.sfm.layout import Layout, image_names
@@ -88,8 +97,10 @@ def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequ
     neighbours, against = neighbours_of(placed), set((report.get("tried") or [{}])[0].get("against", ()))
     sharpness = np.median([look.sharpness for look in looks.values() if np.isfinite(look.sharpness)] or [1])
     brightness = np.median([look.brightness for look in looks.values() if np.isfinite(look.brightness)] or [0])
+    lonely = {name for name in against if report["left_out"].get(name, {}).get("partners", 0) <= LONELY}
     problems = {
-        "left out: its matches contradict the others": against,
+        "left out: its matches contradict the others": against - lonely,
+        "left out: too few other photos match it": lonely,
         "not placed": set(names) - set(placed) - against,
         "weakly connected": set(report["weakly_connected"]),
         "blurred": set(report["blurred"]),

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatting.files.json_files import read_json, write_json
-from splatting.findings.capture import CONTRADICTING, is_wrong
+from splatting.findings.capture import is_folded, is_wrong, only_turned
 from splatting.sfm.colmap import (
     ADDING,
     ALL_PAIRS,
@@ -53,7 +53,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     for number, way in enumerate(ways):
         title = "Mapping" if not number else f"Mapping, try {number + 1}"
         tried.append(_tried(backend, way, partial(place, title), run))
-        if agrees(tried[-1]):
+        if agrees(tried[-1]) or only_turned(tried[-1]):
             break
         if number + 1 < len(ways):
             print(f"{_words(tried[-1])}; trying {name_of(ways[number + 1])}")
@@ -66,10 +66,12 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
         print(f"warning: the poses could not be judged: {best['failed']}", file=sys.stderr)
     (layout.tried / best["way"]).rename(layout.models)
     shutil.rmtree(layout.tried, ignore_errors=True)
+    if not is_folded(best):
+        best["against"] = sorted({*best.get("against", ()), *best.get("alike", ())})
     if best.get("against") and backend.settings.mapper == ADDING:
         old = set(names_in(layout.base_database))
         best["against"] = [name for name in best["against"] if name not in old]
-    if best.get("against"):
+    if best.get("against") and not is_folded(best):
         model = str(layout.models / best["folder"])
         run([worker_command(layout, "keep", model=model, left_out=best["against"])], "Leaving out photos")
         best |= {**_judgement(backend, layout.models, run), "against": best["against"]}  # of those that are left
@@ -78,8 +80,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
 
 def agrees(found: Mapping[str, Any]) -> bool:
     """Whether a judged model is kept without another try."""
-    many = found.get("agreeing", 0) >= AGREEING * found.get("bound", 0) > 0
-    return many and found["contradicting"] <= CONTRADICTING
+    return found.get("agreeing", 0) >= AGREEING * found.get("bound", 0) > 0 and not is_wrong(found)
 
 
 def _tried(
@@ -117,5 +118,7 @@ def _words(found: Mapping[str, Any]) -> str:
         return f"{name_of(found['way'])} failed"
     if not found.get("photos"):
         return f"{name_of(found['way'])} placed no photo"
+    if is_folded(found):
+        return f"{name_of(found['way'])} laid photos of different things upon each other"
     agree = f"{found['agreeing']} of {found['bound']} photos"
     return f"{name_of(found['way'])}: the matches of {agree} agree with their poses"
