@@ -5,9 +5,11 @@
 
 SCENES is as DIR of benchmarks.scenes.captures, which makes the sets. Rows take turns on all checkouts. A place's error
 is a share of the mean distance of the true cameras from their middle, after a robust similarity. `strangers` are photos
-that were placed though they have no place beside the others. The PSNR is of the test photos after a training on the
-result, and on the true poses of the same photos, as they were before undistortion. The seconds of the stages end with
-those of the training's command and of a page; `rest` is what convert.py needs for its start and its report.
+that were placed though they have no place beside the others. `rotation` is the error that rotations alone leave, as a
+share of the longer side, `alike` the number of photos that lie upon photos of other things. The PSNR is of the test
+photos after a training on the result, and on the true poses of the same photos, as they were before undistortion. The
+seconds of the stages end with those of the training's command and of a page; `rest` is what convert.py needs for its
+start and its report.
 """
 
 import argparse
@@ -72,6 +74,7 @@ ROWS = [
     *map(Row, ("bonsai3200/1", "fox_full", "fox_raw", "monstree_raw", "bonsai_small")),
     Row("video", "--video {set}/video.mp4"),
     *map(Row, ("rooms", "phone", "corridor", "two_places", "mirrored", "foreign", "turntable")),
+    *map(Row, ("turning0", "turning1", "turning3", "turning30", "poster", "twin_box")),
     *map(Row, ("crops375", "crops1500")),
 ]
 
@@ -262,22 +265,25 @@ def measured(photos: Path, run: Path, options: Sequence[str], checkout: Path, se
 
 HEADER = [
     *("set", "options", "photos", "s", "placed", "named", "error, %", "90 %", "most", "off", "strangers", "degrees"),
-    *("focal, px", "true", "status", "MiB"),
+    *("focal, px", "true", "rotation, %", "alike", "status", "MiB"),
 ]
 
 
 def cells(result: Result) -> list[str]:
     """A result's cells below HEADER, from the photos on."""
     report, places = result.report, result.places
-    photos, placed, named, compared = "", result.said, "", [""] * 8
+    photos, placed, named, compared, judged = "", result.said, "", [""] * 8, ["", ""]
     if report:
+        found = (report.get("tried") or [{}])[0]
+        judged = [f"{100 * found['rotation']:.2f}" if found.get("rotation") else "", str(len(found.get("alike", ())))]
         photos, placed, named = map(str, (report["photos"], report["registered"], len(report["left_out"])))
     if places:
         shares = 100 * places.errors
         errors = [f"{value:.2f}" for value in (np.median(shares), np.percentile(shares, 90), shares.max())]
         counts = [str((places.errors > _WRONG).sum()), str(places.strangers)]
         compared = [*errors, *counts, f"{places.turn:.2f}", *(f"{value:.1f}" for value in places.focal)]
-    return [photos, f"{result.seconds:.1f}", placed, named, *compared, str(result.status), f"{result.peak:.0f}"]
+    ended = [str(result.status), f"{result.peak:.0f}"]
+    return [photos, f"{result.seconds:.1f}", placed, named, *compared, *judged, *ended]
 
 
 def stages_of(results: Sequence[Result]) -> list[str]:
