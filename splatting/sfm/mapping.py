@@ -6,7 +6,7 @@ Each way fails on some captures, without saying so. The best model is kept, with
 import shutil
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -57,8 +57,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
             break
         if number + 1 < len(ways):
             print(f"{_words(tried[-1])}; trying {name_of(ways[number + 1])}")
-    most = max(found.get("photos", 0) for found in tried)
-    tried.sort(key=partial(_rank, most), reverse=True)
+    tried = sorted(tried, key=partial(_rank, tried), reverse=True)
     best = tried[0]
     if "failed" in best:
         if not any((layout.tried / best["way"]).glob("*/*")):
@@ -103,10 +102,16 @@ def _judgement(backend: Backend, models: Path, run: Callable[..., None]) -> dict
     return read_json(out)
 
 
-def _rank(most: int, found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
-    """How good a model is. most: number of photos of the largest; one that is far smaller may be right by chance."""
-    photos = found.get("photos", 0)
-    return photos > 0, not is_wrong(found) and 2 * photos >= most, found.get("agreeing", 0), photos
+def _rank(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
+    """Return how good a model is among those that were tried, as a sort key.
+
+    One that is far smaller than another may be right by chance. One that lacks photos of a folded model may be folded
+    where these would show it.
+    """
+    photos, most = found.get("photos", 0), max(one.get("photos", 0) for one in tried)
+    folded = max((one["photos"] for one in tried if is_folded(one)), default=0)
+    is_sound = not is_wrong(found) and 2 * photos >= most and photos >= AGREEING * folded
+    return photos > 0, is_sound, found.get("agreeing", 0), photos
 
 
 def name_of(way: str) -> str:
