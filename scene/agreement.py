@@ -24,7 +24,6 @@ FLOOR = 5e-4  # if that is also this share of the photo's longer side
 _BEHIND = 0.7  # share of a pair's matches behind a photo, from which it contradicts; without parallax it is a half
 _HEARD = 100  # matches of a pair that count; or two photos that show nearly the same would outvote all others
 _SHARING = 10  # other photos of a photo, whose tracks are compared
-_NAMED = 3  # pairs of photos that show different things
 _ROUNDS = 3  # of reweighted least squares
 # Other pairs' focal lengths are not known well enough, or they show nothing of depth (COLMAP's configurations).
 _CALIBRATED = {
@@ -62,7 +61,7 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
 
     It is `verdict` with what pairs alone do not say. bound: the number of photos that pairs join to one another, those
     without a pose, too. rotation: rotation_error. alike: photos without which none stands where it shows other things
-    than its neighbours. alike_pairs: the clearest pairs of these.
+    than its neighbours. alike_pair: the clearest pair of these, or none.
     """
     compared = sorted(overlaps(model, database), key=lambda pair: -pair.empty)
     alike = [pair[:2] for pair in compared if pair.is_unmatched]
@@ -70,7 +69,7 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
         "bound": len(joined(_linked(database))),
         "rotation": rotation_error(database),
         "alike": cover(alike),
-        "alike_pairs": alike[:_NAMED],
+        "alike_pair": alike[0] if alike else None,
     }
 
 

@@ -205,7 +205,7 @@ def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, a
     ("found", "tried", "left_out"),
     [
         ({"alike": ["7.jpg"]}, 1, ["7.jpg"]),  # one photo among those of another thing is left out
-        ({"alike": ["7.jpg", "8.jpg", "9.jpg"], "alike_pairs": [["7.jpg", "1.jpg"]]}, 4, []),  # parts upon each other
+        ({"alike": ["7.jpg", "8.jpg", "9.jpg"], "alike_pair": ["7.jpg", "1.jpg"]}, 2, []),  # parts upon each other
         ({"rotation": 0.002}, 1, []),  # no way places a camera that only turned
     ],
 )

@@ -86,6 +86,8 @@ def of_model(
     out = sorted(set(images) - set(chosen.registered) - set(against))
     if tried:
         yield from _of_judgement(tried[0], len(images), partners)
+        if only_turned(tried[0]) or is_folded(tried[0]):
+            return  # what else is wrong comes of it
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
         text = f"{len(out)} of {len(images)} photos left out ({some(out)})"
@@ -117,8 +119,9 @@ def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, 
         yield Finding(text, "walk, do not turn: take each photo some steps from the one before")
         return
     if is_folded(found):
-        pairs = " and ".join(f"{one} with {other}" for one, other in found["alike_pairs"])
-        text = f"parts of the scene look alike and are laid upon each other ({pairs} show different things)"
+        one, other = found["alike_pair"]
+        text = f"parts that look alike are laid upon each other: {one} and {other} stand in one place, and show"
+        text += " different things"
         yield Finding(text, "take photos that lead from one part to the other, or convert each part by itself")
         return
     if not found.get("pairs") and "failed" not in found:

@@ -27,6 +27,7 @@ from splatting.sfm.colmap import (
 from utils.system_utils import UserError
 
 AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
+_FOLDED = 2  # ways that fold a scene, after which no other is tried
 _NAMES = {
     "simple": "global mapping, at first without distortion",
     "free": "incremental mapping without given focal lengths",
@@ -53,7 +54,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     for number, way in enumerate(ways):
         title = "Mapping" if not number else f"Mapping, try {number + 1}"
         tried.append(_tried(backend, way, partial(place, title), run))
-        if agrees(tried[-1]) or only_turned(tried[-1]):
+        if agrees(tried[-1]) or only_turned(tried[-1]) or sum(map(is_folded, tried)) == _FOLDED:
             break
         if number + 1 < len(ways):
             print(f"{_words(tried[-1])}; trying {name_of(ways[number + 1])}")
