@@ -13,30 +13,40 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
+import os
 import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from arguments import OptionParser
-from scene.readers.scene_folder import is_apart
-from splatting.findings.capture import lines_of, training_options, unusable
+from scene.readers.scene_folder import WORK, find_capture, is_apart, is_scene
+from splatting.findings.capture import is_unfinished, lines_of, stages_of, state_of, training_options, unusable
 from splatting.host import torchrun
+from splatting.host.listing import some
 from splatting.host.start import typed_command
 from splatting.sfm import stages
 from splatting.sfm.adding import added_line, forget_base, keep_base
 from splatting.sfm.cameras import MODES
 from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
-from splatting.sfm.images import link
-from splatting.sfm.inputs import PHOTO_SUFFIXES, VIDEO_SUFFIXES, sort_inputs, unused_lines
-from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder
+from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
+from splatting.sfm.layout import (
+    FEWEST,
+    Layout,
+    find_images,
+    refuse_foreign_results,
+    scene_folder,
+    take_photos_beside,
+)
 from splatting.sfm.orienting import said_of
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
 from splatting.sfm.video import FRAMES_MISSING, NOTE, report_entries, taken_frames, video_lines
 from utils.system_utils import UserError, run_cli
 
+_NAMING = ("poses", "mask_path")  # options that name a file
 _BESIDE_POSES = ("camera", "mapper", "video", "skip_matching", "colmap_executable")
 
 
@@ -44,9 +54,12 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     """Run the stages that are not done; print how many photos were placed, and advice about the others."""
     masks = _masks(args.mask_path)
     videos = _videos(args.video)
+    if not args.skip_matching:
+        take_photos_beside(layout, bool(videos))
     found = None if videos else find_images(layout, args.skip_unreadable)
     refuse_while_working(layout.log)
     record = stages.StageRecord(layout.stages)
+    record.note("options", args.options)
     refuse_foreign_results(layout, record.begun("undistortion"), record.begun("photos"), args.skip_matching)
     if not videos and record.interrupted("video"):
         print(f"warning: {FRAMES_MISSING}", file=sys.stderr)
@@ -58,6 +71,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     for line in unused_lines(found.unused):
         print(line)
     names = found.photos
+    record.note("files", {name: state_of(layout.input / name) for name in names})
     if args.skip_matching:
         planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
@@ -81,13 +95,18 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     kept += record.run(planned)
     if kept:
         print(f"reused from an earlier run: {', '.join(kept)}; remove {layout.work} to start from the beginning")
+    _conclude(layout, found, args.add)
+
+
+def _conclude(layout: Layout, found: Inputs, adding: bool) -> None:
+    """Print what came out, and how to train it; exit with status 3 if it is not to be trained."""
     notes = [NOTE] if taken_frames(layout) else []
     report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
     print("\n".join((summary(report), lens_words(report), *lines_of(report), *said_of(layout))))
     print(f"all of it: {layout.page}")
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
-    if args.add:
+    if adding:
         print(added_line(layout, report["left_out"]))
     for line in notes:
         print(f"note: {line}")
@@ -101,28 +120,40 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
 
 
 def convert_first(source: str) -> None:
-    """For train.py: convert a folder of photos or videos that has no cameras yet; do nothing with any other folder.
+    """For train.py: convert a folder of photos or videos that has no cameras yet, or finish what was begun.
 
-    The photos are in its sub-folder `input`, or directly in it: then `input` gets links to them.
+    Do nothing with any other folder. The photos are in its sub-folder `input`, or directly in it.
     """
     folder = Path(source)
-    if not folder.is_dir() or not is_apart(folder) or torchrun.size() > 1:
+    if not folder.is_dir() or torchrun.size() > 1:
         return
-    layout = Layout(folder.absolute())
-    files = [path for path in sorted(folder.iterdir()) if path.is_file() and not path.name.startswith(".")]
-    photos = [path for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
-    inputs = {path.name for path in layout.input.iterdir()} if layout.input.is_dir() else set()
-    # An `input` that has nothing but what lies beside it is one that an earlier run made.
-    photos = photos if inputs <= {path.name for path in photos} else []
-    is_video = not photos and (not inputs or report_entries(layout))
-    videos = [str(path.absolute()) for path in files if path.suffix.lower() in VIDEO_SUFFIXES] if is_video else []
-    if not (inputs or photos or videos):
+    found = find_capture(folder.absolute())
+    words, begun = ["--video", *map(str, found.videos)] if found.is_video else [], None
+    odd = found.place != folder.absolute() or os.path.lexists(folder / "input") and not (folder / "input").is_dir()
+    if is_unfinished(folder):
+        there = f"; to train what is there, remove {folder / WORK}" if is_scene(folder) else ""
+        print(f"a conversion of {folder} was not finished: finishing it first{there}")
+        begun = _begun_options(folder)
+    elif is_apart(folder) and (found.photos or found.videos or odd):
+        print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
+        if found.is_video and found.photos:
+            print(f"taking frames of {some([path.name for path in found.videos])}, which is more than the photos")
+    else:
         return
-    for path in photos:
-        if path.name not in inputs:
-            link(path, layout.input / path.name)
-    print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
-    main(["-s", str(layout.scene), *(["--video", *videos] if videos else [])])
+    main(["-s", str(folder.absolute()), *(words if begun is None else ())], **begun or {})
+
+
+def _begun_options(folder: Path) -> dict[str, Any] | None:
+    """Return the options of the conversion that was begun in a folder; None if files that they name are gone."""
+    try:
+        options = dict(stages_of(folder)["options"]["made_from"])
+        named = [*options.get("video", []), *(options[name] for name in _NAMING if name in options)]
+        complete = all(map(os.path.exists, named))
+    except (KeyError, TypeError, ValueError):
+        return None
+    if options.get("colmap_executable"):  # a program that a downloaded folder may name
+        raise UserError(f"the conversion of {folder} was begun with --colmap_executable; finish it by that command")
+    return options if complete else None
 
 
 def _masks(given: str | None) -> Path | None:
@@ -177,8 +208,8 @@ def _refuse_beside(option: str, reason: str, args: argparse.Namespace, *others: 
             raise UserError(f"--{other} does not go with --{option}, {reason}; omit one")
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command line."""
+def main(argv: Sequence[str] | None = None, **options: Any) -> None:
+    """Run the command line. options: beside those of argv."""
     parser = OptionParser(description="Convert the photos in SCENE/input, or a video, to a scene for train.py.")
     add = parser.add_argument
     add("-s", "--source_path", required=True, metavar="SCENE",
@@ -222,7 +253,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         "(default: 8192)")  # fmt: skip
     add("--mask_path", default=None, metavar="FOLDER",
         help="masks with the photos' names and .png appended; black areas get no features (default: none)")  # fmt: skip
+    usual = vars(parser.parse_args(["-s", ""]))
+    parser.set_defaults(**{name: value for name, value in options.items() if name in usual})
     args = parser.parse_args(argv)
+    differing = {name: value for name, value in vars(args).items() if value != usual[name] and name != "source_path"}
+    args.options = differing | {name: os.path.abspath(differing[name]) for name in _NAMING if differing.get(name)}
+    if args.video:
+        args.options["video"] = [*map(os.path.abspath, args.video)]
     for option, least in (("max_num_features", 100), ("video_frames", FEWEST)):
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")

@@ -18,6 +18,7 @@ import torch
 from arguments import write_cfg_args, write_model_json
 from arguments.launch import launch_options, training_parser
 from scene.readers.scene_folder import is_scene
+from splatting.findings.capture import is_unfinished
 from splatting.registry import check_together, chosen, tools
 from splatting.training.agreement import agree_on_options
 from splatting.training.events import summary_writer
@@ -104,7 +105,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
-    if dataset.source_path and not is_scene(dataset.source_path):
+    if dataset.source_path and (is_unfinished(dataset.source_path) or not is_scene(dataset.source_path)):
         from convert import convert_first  # which no other training needs
 
         convert_first(dataset.source_path)

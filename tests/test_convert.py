@@ -15,9 +15,12 @@ from PIL import Image
 from synthetic import folder_state
 
 import convert
+import train
 from scene.dataset_readers import read_scene
+from scene.readers.scene_folder import is_scene
 from scene.readers.tracks import read_tracks
-from splatting.sfm import stages
+from splatting.findings.capture import check_conversion, is_unfinished, left_out
+from splatting.sfm import capture_page, stages
 from splatting.sfm.colmap import Pycolmap, Settings
 from splatting.sfm.images import check_images, prepare_images
 from splatting.sfm.layout import Layout
@@ -182,14 +185,10 @@ def test_photos_that_share_nothing(tmp_path):
     assert not (tmp_path / "images").exists()
 
 
-def _photos_beside(scene: Path) -> None:
-    (scene / "input").rename(scene / "away")
-    for path in (scene / "away").iterdir():
-        path.rename(scene / path.name)
-
-
 def _trained(scene: Path) -> None:
-    _photos_beside(scene)
+    for path in (scene / "input").iterdir():
+        path.rename(scene / path.name)
+    (scene / "input").rmdir()
     (scene / "cfg_args").touch()
 
 
@@ -204,8 +203,22 @@ def _few(scene: Path) -> None:
     (scene / "input" / "walk.mp4").touch()
 
 
+def _only_video(scene: Path) -> None:
+    (scene / "input").rename(scene / "depth")
+    (scene / "rgb.mp4").touch()
+
+
+def _in_a_scene(scene: Path) -> None:
+    (scene / "input").rename(scene / "else")
+    (scene / "transforms.json").touch()
+
+
 def _renamed(name: str) -> Callable[[Path], object]:
-    return lambda scene: (scene / "input").rename(scene / name)
+    def rename(scene: Path) -> None:
+        (scene / name).parent.mkdir(parents=True, exist_ok=True)
+        (scene / "input").rename(scene / name)
+
+    return rename
 
 
 def _given(folder: Path, count: int) -> Path:
@@ -235,9 +248,11 @@ def _of_poses(old: str, new: str) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("words", "change", "said"),
     [
-        ("-s {}", _photos_beside, r"no folder input in .*room, but 3 photos directly in it; make .*input, move them"),
         ("-s {}", _renamed("images"), r"rename its folder images to input"),
-        ("-s {}", _renamed("else"), r"make it and put the photos there, or pass"),
+        ("-s {}", _renamed("else"), r"rename its folder else to input and run .*convert.py -s .*room$"),
+        ("-s {}", _renamed("else.pdf/a/b"), r"make it and put the photos there, or pass"),
+        ("-s {}", _only_video, r"no folder input in .*room; run .*convert.py -s .*room --video .*room/rgb.mp4"),
+        ("-s {}/else", _in_a_scene, r"no folder input in .*else, which lies in a scene already: train.py takes it"),
         ("-s {}", lambda scene: (scene / "images").mkdir(), r"already has images, which convert.py did not make"),
         ("-s {}", lambda scene: (scene / "capture.html").touch(), r"already has capture.html, which convert.py did"),
         ("-s {} --resize", lambda scene: (scene / "images_4").mkdir(), r"did not make .*images_4, and --resize would"),
@@ -301,6 +316,31 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(stages, "refuse_nothing", lambda *_: (_ for _ in ()).throw(UserError("no model")))
         refused("no model", "--mapper", "global")
+
+
+def _interrupt(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.slow
+def test_a_verdict_outlives_an_interruption_and_train_finishes_what_was_begun(copy, monkeypatch):
+    """The folder is a scene only when photos and verdict are there, too."""
+    verdict, again = "no way of mapping", ["-s", str(copy), "--no_gpu", "--lenses"]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(stages.report, "unusable", lambda _: verdict)
+        patch.setattr(capture_page, "write_page", _interrupt)
+        convert.main([*again, "native"])
+    assert verdict in left_out(copy) and is_scene(copy) and is_unfinished(copy)
+    assert [line for line in map(str, check_conversion(copy)) if f"says of this scene: {verdict}" in line]
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(stages.report, "write_report", _interrupt)
+        convert.main([*again, "undistort"])
+    assert not is_scene(copy) and (copy / "images").is_dir()
+    with pytest.raises(StopIteration):  # in place of the training
+        monkeypatch.setattr(train, "safe_state", lambda *_: next(iter(())))
+        train.main(["-s", str(copy), "-m", str(copy / "out")])
+    report = json.loads((copy / "convert_report.json").read_text())
+    assert (report["lenses"], report["unusable"]) == ("undistort", None) and not is_unfinished(copy)
 
 
 def test_masks_keep_features_away(converted, tmp_path):

@@ -1,6 +1,9 @@
 """Steps of convert.py by themselves: pairs, smaller copies, points by patches, and what train.py converts first."""
 
 import contextlib
+import os
+import re
+import shutil
 import sqlite3
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,10 +17,14 @@ from PIL import Image
 
 import convert
 import train
+from scene.readers.scene_folder import REPORT, find_capture
+from splatting.findings.capture import changed_photos, is_unfinished, state_of
 from splatting.sfm import pairing, reduced
 from splatting.sfm.dense_points import more_points
+from splatting.sfm.layout import Layout, find_images, take_photos_beside
 from splatting.sfm.pairing import first_pairs, likeness, named_by_id, restore_names, rounds
 from splatting.sfm.reduced import enlarged, longest_side, reduce_photos
+from splatting.sfm.stages import Stage, StageRecord
 from utils.system_utils import UserError
 
 PLACES, EACH = 10, 8  # photos of the same place look alike
@@ -129,28 +136,133 @@ def test_train_converts_photos_that_have_no_cameras(tmp_path, capsys):
     }
 
 
-def test_what_train_converts(tmp_path, monkeypatch):
-    calls = []
+def _fill(folder: Path, *names: str, size: int = 0) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in (folder / name for name in names):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(bytes(size))
+
+
+LIVE = [f"{letter}{end}" for letter in "abc" for end in (".HEIC", ".mov")]
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        (["walk.mp4", "data.csv", "depth/0.png", "depth/1.png"], "--video {}/walk.mp4"),  # as StrayScanner has it
+        (["cover.jpg", "walk.mp4"], "--video {}/walk.mp4"),
+        (["a.jpg", "b.jpg", "c.jpg", "walk.mp4"], ""),
+        (["input/walk.mp4", ".a.jpg", "._b.jpg"], "--video {}/input/walk.mp4"),
+        (["input/a.png", "b.png"], ""),
+        (["input/.DS_Store", "input/._a.jpg", "a.jpg"], ""),
+        (["input/without_suffix"], ""),
+        (LIVE, ""),
+        (["a.ply"], None),
+        (["sparse/x", "a.png"], None),
+        (["one/sparse/x", "a.png"], None),
+        ([".a.jpg"], None),
+    ],
+)
+def test_what_train_converts(tmp_path, monkeypatch, files, words):
+    calls: list[list[str]] = []
     monkeypatch.setattr(convert, "main", calls.append)
-    made = {"video": ["walk.mp4"], "photos": ["input/a.png", "b.png"], "none": ["a.ply"]}
-    made |= {"scene": ["sparse/x", "a.png"], "above": ["one/sparse/x", "a.png"], "live": ["a.HEIC", "a.mov"]}
-    for name, files in made.items():
-        for file in files:
-            (tmp_path / name / file).parent.mkdir(parents=True, exist_ok=True)
-            (tmp_path / name / file).touch()
-        (tmp_path / name).mkdir(exist_ok=True)
-        convert.convert_first(str(tmp_path / name))
+    _fill(tmp_path, *files)
+    convert.convert_first(str(tmp_path))
     convert.convert_first(str(tmp_path / "missing"))
-    video, photos, live = (str(tmp_path / name) for name in ("video", "photos", "live"))
-    assert calls == [["-s", video, "--video", f"{video}/walk.mp4"], ["-s", photos], ["-s", live]]
-    assert [path.name for path in (tmp_path / "photos" / "input").iterdir()] == ["a.png"]  # b was not put there
-    assert not (tmp_path / "above" / "input").exists()
-    # Photos that come later, where the first ones were.
-    (tmp_path / "live" / "b.HEIC").touch()
-    convert.convert_first(live)
-    assert sorted(path.name for path in (tmp_path / "live" / "input").iterdir()) == ["a.HEIC", "b.HEIC"]
-    with pytest.raises(UserError, match="is not a scene"):
-        train.main(["-s", str(tmp_path / "none"), "-m", str(tmp_path / "out")])
+    assert calls == ([] if words is None else [["-s", str(tmp_path), *words.replace("{}", str(tmp_path)).split()]])
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()} == set(files)
+
+
+def test_the_larger_kind_is_converted(tmp_path):
+    _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", size=10)
+    _fill(tmp_path, "walk.mp4", size=31)
+    assert find_capture(tmp_path).is_video
+    _fill(tmp_path, "d.jpg", size=10)
+    assert not find_capture(tmp_path).is_video
+
+
+def _inputs(scene: Path, is_video: bool = False) -> list[str]:
+    layout = Layout(scene)
+    take_photos_beside(layout, is_video)
+    return find_images(layout, True).photos if not is_video else [layout.input.name]
+
+
+def test_photos_are_those_that_are_there(tmp_path, capsys):
+    """Beside what a conversion made; no copy and no link of an earlier run is asked."""
+    make_photos(tmp_path / "room", 5)
+    names, scene = [f"photo_0{k}.png" for k in range(5)], tmp_path / "room"
+    _fill(scene, ".hidden.jpg", "input/.DS_Store", "capture.html", "orientation.json", "images/x.png", "notes.txt")
+    assert _inputs(scene) == names
+    (scene / names[0]).unlink()
+    (scene / names[1]).rename(scene / "b.png")
+    assert _inputs(scene) == ["b.png", *names[2:]]
+    assert _inputs(scene, is_video=True) == ["input"]
+    assert (
+        "not used: b.png, photo_02.png, photo_03.png, photo_04.png (beside the folder input" in capsys.readouterr().out
+    )
+    for name in names[2:]:
+        (scene / name).rename(scene / "input" / name)
+    assert _inputs(scene) == names[2:]
+    assert capsys.readouterr().out == "not used: b.png (beside the folder input: move them into it)\n"
+
+
+@pytest.mark.parametrize(("what", "said"), [
+    (lambda scene: (scene / "input").touch(), "input is a file; remove it, and make a folder of that name"),
+    (lambda scene: (scene / "input").symlink_to("nowhere"), "input is a link to nothing; remove it, and make"),
+    (lambda scene: (scene / "0.png").write_bytes(b""), r"0.png is empty; .* or pass --skip_unreadable to convert.py"),
+])  # fmt: skip
+def test_what_stands_in_the_way_is_named(tmp_path, what, said):
+    make_photos(tmp_path, 3)
+    what(tmp_path)
+    with pytest.raises(UserError, match=said):
+        train.main(["-s", str(tmp_path), "-m", str(tmp_path / "out")])
+    assert not (tmp_path / "distorted").exists()
+
+
+def test_a_folder_that_is_read_only_is_named(tmp_path, monkeypatch):
+    make_photos(tmp_path, 3)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with pytest.raises(UserError, match="is read-only; copy the photos to a folder of your own"):
+        train.main(["-s", str(tmp_path), "-m", str(tmp_path / "out")])
+
+
+def test_a_conversion_is_finished_with_its_own_options(tmp_path, monkeypatch):
+    calls: list[tuple] = []
+    monkeypatch.setattr(convert, "main", lambda words, **options: calls.append((words, options)))
+    _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", "masks/a.png", "distorted/sparse/0/cameras.bin")
+    given, plain = {"camera": "OPENCV_FISHEYE", "mask_path": str(tmp_path / "masks")}, ["-s", str(tmp_path)]
+    record = StageRecord(tmp_path / "distorted" / "stages.json")
+    record.note("options", given)
+    record.run([Stage("photos", 1, lambda: None, lambda: None)])
+    convert.convert_first(str(tmp_path))
+    shutil.rmtree(tmp_path / "masks")
+    convert.convert_first(str(tmp_path))
+    record.note("options", 5)
+    record.run([Stage("photos", 2, lambda: None, lambda: None)])
+    convert.convert_first(str(tmp_path))
+    record.note("options", {"colmap_executable": "./any"})
+    record.run([Stage("photos", 3, lambda: None, lambda: None)])
+    with pytest.raises(UserError, match="begun with --colmap_executable; finish it by that command"):
+        convert.convert_first(str(tmp_path))
+    record.run([Stage("capture", 1, lambda: None, lambda: None)])
+    assert calls == [(plain, given), (plain, {}), (plain, {})] and not is_unfinished(tmp_path)
+
+
+def test_photos_that_change_after_a_conversion_are_named(tmp_path):
+    _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", "capture.html", size=1)
+    (tmp_path / REPORT).write_text('{"unused": {"live.CR2": "same name"}}')
+    record = StageRecord(tmp_path / "distorted" / "stages.json")
+    record.note("options", {"no_gpu": True, "camera": "FOV"})
+    record.note("files", {name: state_of(tmp_path / name) for name in ("a.jpg", "b.jpg", "c.jpg")})
+    record.run([Stage("capture", 1, lambda: None, lambda: None)])
+    _fill(tmp_path, "live.CR2")
+    assert changed_photos(tmp_path) is None
+    shutil.copytree(tmp_path, tmp_path / "copy", copy_function=shutil.copyfile)
+    assert changed_photos(tmp_path / "copy") is None
+    (tmp_path / "a.jpg").rename(tmp_path / "d.jpg")
+    _fill(tmp_path, "b.jpg", size=2)
+    said = r": 1 new \(d.jpg\), 1 gone \(a.jpg\), 1 changed \(b.jpg\); .*convert.py -s .* --camera FOV --no_gpu$"
+    assert re.search(said, changed_photos(tmp_path))
 
 
 @pytest.mark.parametrize(("name", "mode"), [

@@ -2,16 +2,21 @@
 
 import os
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 from scene.readers.metashape import cameras_xml
 from scene.readers.phone_scans import polycam_capture, record3d_capture
+from splatting.files.image_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from splatting.host.listing import some
 from splatting.host.start import typed_command
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"
-_PICTURES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp")
+REPORT = "convert_report.json"  # of a scene that convert.py made
+WORK = "distorted"  # of a conversion, whose models are no scene
+FEWEST = 3  # photos that are converted
 _PACKED = (".zip", ".r3d")  # as apps export them
 _ZIP = " (.r3d is ZIP by another name)"
 _MODEL = ("cameras.bin", "cameras.txt")
@@ -29,7 +34,7 @@ def kind_of(source_path: str | os.PathLike) -> str:
             f"{folder} is an archive (a .r3d is a ZIP, too); unpack it, and give -s the folder that comes out"
         )
     if not folder.is_dir():
-        raise UserError(f"{folder} is a file; give -s the folder of the scene{_or_rather(_above(folder.parent))}")
+        raise UserError(f"{folder} is a file; give -s the folder of the scene{_or_rather(scene_above(folder.parent))}")
     kind = _kind(folder)
     if kind is None:
         found = sorted(path.name for path in folder.iterdir())
@@ -48,8 +53,51 @@ def is_scene(folder: str | os.PathLike) -> bool:
 
 def is_apart(folder: Path) -> bool:
     """Whether a folder is no scene and no model, has no scene in it, and lies in none."""
-    inner = any(path.is_dir() and _kind(path) for path in folder.iterdir())
-    return not (inner or _above(folder) or (folder / "cfg_args").is_file())
+    return not (_scenes_in(folder) or scene_above(folder) or (folder / "cfg_args").is_file())
+
+
+class Capture(NamedTuple):
+    """What a folder without cameras has: where photos and videos lie, `input` or the folder itself, and both."""
+
+    place: Path
+    photos: list[Path]
+    videos: list[Path]
+
+    @property
+    def is_video(self) -> bool:
+        """Whether the videos are the larger kind, or the photos are too few."""
+        photos, videos = (sum(path.stat().st_size for path in paths) for paths in (self.photos, self.videos))
+        return bool(self.videos) and (len(self.photos) < FEWEST or videos > photos)
+
+
+def find_capture(folder: Path) -> Capture:
+    """Find the photos and videos of a folder by their names, without hidden ones and the videos of Live Photos."""
+    place = folder / "input"
+    files = visible_files(place, place.rglob("*"))
+    if not files:
+        place, files = folder, visible_files(folder, folder.glob("*"))
+    photos, videos = ([path for path in files if path.suffix.lower() in s] for s in (PHOTO_SUFFIXES, VIDEO_SUFFIXES))
+    stills = {path.with_suffix("") for path in photos} if len(photos) >= FEWEST else set()
+    return Capture(place, photos, [path for path in videos if path.with_suffix("") not in stills])
+
+
+def visible_files(folder: Path, paths: Iterable[Path]) -> list[Path]:
+    """The files among the paths below a folder, sorted, without hidden ones and those in hidden folders."""
+    seen = (path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))
+    return sorted(path for path in seen if path.is_file())
+
+
+def how_to_convert(folder: Path) -> str:
+    """Say how the photos or videos of a folder get cameras; "" if there are none."""
+    found, command = find_capture(folder), f"{typed_command('convert.py')} -s {shlex.quote(str(folder))}"
+    if found.is_video:
+        return f"run {command} --video {shlex.join(map(str, found.videos))}"
+    if found.photos:
+        return f"run {command}"
+    folders = (path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+    inner = sorted(path.name for path in folders if _has_pictures(path))
+    which = inner[0] if len(inner) == 1 else f"of photos ({some(inner)})"
+    return f"rename its folder {which} to input and run {command}" if inner else ""
 
 
 def _kind(folder: Path) -> str | None:
@@ -71,25 +119,24 @@ def camera_file(folder: Path) -> Path | None:
 def _remedy(folder: Path) -> str:
     if (folder / "cfg_args").is_file():
         return "it is a model that train.py wrote: give it as -m, and its scene as -s"
-    below = sorted(path for path in folder.iterdir() if path.is_dir() and _kind(path))
-    if below:
+    if below := _scenes_in(folder):
         return f"give -s a scene in it: {some(list(map(str, below)))}"
-    if above := _above(folder):
+    if above := scene_above(folder):
         return f"give -s {above}, which is a scene"
     if any((folder / name).is_file() for name in _MODEL):
         return "the files of a COLMAP model belong in a folder sparse/0 of the scene, beside the folder images"
     if packed := sorted(path.name for path in folder.iterdir() if path.suffix.lower() in _PACKED):
         return f"unpack {some(packed)}{_ZIP}, and give -s the folder that comes out"
-    inner = [path for path in (folder / "input", folder / "images", folder) if path.is_dir() and _has_pictures(path)]
-    if inner and inner[0].name == "input":
-        return f"photos need camera poses: run {typed_command('convert.py')} -s {shlex.quote(str(folder))} first"
-    if inner:
-        command = f"{typed_command('convert.py')} -s {shlex.quote(str(folder))}"
-        return f"photos need camera poses: put them into a folder {folder / 'input'} and run {command} first"
+    if command := how_to_convert(folder):
+        return f"photos need camera poses: {command} first"
     return "give -s the folder that holds one of them"
 
 
-def _above(folder: Path) -> Path | None:
+def _scenes_in(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and path.name != WORK and _kind(path))
+
+
+def scene_above(folder: Path) -> Path | None:
     """The scene that contains this folder, at most two levels up, as for images/left or sparse/0."""
     return next((path for path in (folder, *folder.absolute().parents[:2]) if _kind(path)), None)
 
@@ -100,4 +147,4 @@ def _or_rather(scene: Path | None) -> str:
 
 def _has_pictures(folder: Path) -> bool:
     # No deeper: the folder may be any on the disk.
-    return any(path.suffix.lower() in _PICTURES for pattern in ("*", "*/*") for path in folder.glob(pattern))
+    return any(path.suffix.lower() in PHOTO_SUFFIXES for pattern in ("*", "*/*") for path in folder.glob(pattern))

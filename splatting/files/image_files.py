@@ -28,6 +28,17 @@ UNREADABLE = (
     *(TypeError, LookupError, ArithmeticError, struct.error),
 )  # Pillow raises these for broken files, depending on the format
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
+HEIF_SUFFIXES = (".heic", ".heif", ".hif", ".avif")
+RAW_SUFFIXES = (
+    *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr", ".iiq"),
+    *(".gpr", ".rwl", ".x3f"),
+)
+# Files of these names are taken for photos before they are opened; those that cannot be used are named later.
+PHOTO_SUFFIXES = (*SUFFIXES, *HEIF_SUFFIXES, *RAW_SUFFIXES, ".jp2", ".tga", ".ppm")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".wmv"),
+    *(".insv", ".360", ".osv"),  # of cameras with two lenses
+)
 # What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
 # file's name is.
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "AVIF", "HEIF", "TGA")

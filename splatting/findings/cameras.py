@@ -19,6 +19,7 @@ from scene.readers.info import (
     photo_size,
     standing_apart,
 )
+from scene.readers.scene_folder import find_capture
 from scene.readers.tracks import enlargement
 from splatting.findings import Finding, Severity, fine
 from splatting.host.listing import some
@@ -171,10 +172,11 @@ def _places(info: SceneInfo) -> Iterator[Finding]:
 def check_lenses(source: str, views: Sequence[CameraInfo]) -> Iterator[Finding]:
     """Photos that share a camera although their EXIF data tell different focal lengths."""
     shared: dict[tuple, Counter[float]] = {}
+    shots = find_capture(Path(source)).place
     for view in views:
-        # Programs that undistort photos keep few EXIF data: convert.py has the photos themselves in `input`.
+        # Programs that undistort photos keep few EXIF data: convert.py has the photos themselves.
         lens = read_lens(view.image_path)
-        lens = lens if lens.length else read_lens(Path(source, "input", view.image_name))
+        lens = lens if lens.length else read_lens(shots / view.image_name)
         key = view.width, view.height, view.fx, view.fy, view.cx, view.cy
         shared.setdefault(key, Counter())[lens.length] += 1
     for lengths in shared.values():

@@ -5,6 +5,7 @@ For convert.py's report, and for those that read it: train.py and doctor.py.
 
 import math
 import os
+import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -13,18 +14,19 @@ import numpy as np
 
 from scene.images.exif import Lens
 from scene.images.exposures import EXPOSURES
+from scene.readers.scene_folder import REPORT, WORK, find_capture
 from splatting.files.json_files import read_json
-from splatting.findings import Finding, fine
+from splatting.findings import Finding, fine, note
 from splatting.findings.photo_files import blurred
 from splatting.findings.points import FEWEST_POINTS
 from splatting.host.listing import some
+from splatting.host.start import typed_command
 from splatting.registry import tools
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     from splatting.sfm.report import Model
 
-REPORT = "convert_report.json"
 SHORT_TRACKS = 3.0  # views per point; with fewer, most points depend on a single pair
 LARGE_ERROR = 1.5, 1e-3  # pixels, and share of the longer side; a good model of sharp photos has 0.3 to 1 pixels
 CONTRADICTING = 0.1  # share of the matches; right models had 0.09 at most, wrong ones 0.04 to 0.97
@@ -294,9 +296,57 @@ def unusable(report: Mapping[str, Any]) -> str | None:
     if placed >= LEAST * count:
         return None
     return (
-        f"only {placed} of {count} photos are placed, so the scene is incomplete; the lines above say what to "
+        f"only {placed} of {count} photos are placed, so the scene is incomplete; capture.html in it says what to "
         "photograph again"
     )
+
+
+def state_of(path: Path) -> list[Any]:
+    """Describe a file, so that changes show: name, bytes, time of the last change."""
+    stat = path.stat()
+    return [path.name, stat.st_size, stat.st_mtime_ns]
+
+
+def stages_of(source: str | os.PathLike) -> dict[str, Any]:
+    """Return what the last conversion in a folder wrote of its stages, in stages.json; {}: nothing, or it is damaged.
+
+    Each has `done`, and `made_from`; the notes `options` and `photos` have values of that conversion.
+    """
+    try:
+        return {name: dict(entry) for name, entry in read_json(Path(source) / WORK / "stages.json").items()}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def is_unfinished(source: str | os.PathLike) -> bool:
+    """Whether a conversion was begun in a folder, and ended before its last stage."""
+    return bool(found := stages_of(source)) and not found.get("capture", {}).get("done")
+
+
+def changed_photos(source: str | os.PathLike) -> str | None:
+    """Say which photos of a scene that convert.py made are new, gone or changed since; None: none."""
+    stages, found = stages_of(source), find_capture(Path(source))
+    try:
+        before, options = dict(stages["files"]["made_from"]), dict(stages["options"]["made_from"])
+        ignored = set(read_json(Path(source) / REPORT)["unused"])
+    except (OSError, LookupError, TypeError, ValueError):
+        return None
+    there = {name: state_of(found.place / name) for name in before if (found.place / name).is_file()}
+    if not there or is_unfinished(source):
+        return None
+    changed = [name for name, state in there.items() if state != before[name]]
+    if len(changed) == len(there) and all(state[:2] == before[name][:2] for name, state in there.items()):
+        changed = []  # the folder is a copy
+    now = {path.relative_to(found.place).as_posix() for path in found.photos}
+    kinds = {"new": now - set(before) - ignored, "gone": set(before) - set(there), "changed": changed}
+    said = [f"{len(names)} {kind} ({some(sorted(names))})" for kind, names in kinds.items() if names]
+    words = ["-s", str(source)]
+    for name, value in options.items():
+        words += [f"--{name}", *([] if value is True else map(str, value if isinstance(value, list) else [value]))]
+    if not said:
+        return None
+    command = f"{typed_command('convert.py')} {shlex.join(words)}"
+    return f"photos have changed since this scene was converted: {', '.join(said)}; to convert them, run {command}"
 
 
 def left_out(source: str | os.PathLike) -> str | None:
@@ -323,14 +373,24 @@ def already_undistorted(source: str | os.PathLike) -> bool:
 def check_conversion(source: str | os.PathLike) -> Iterator[Finding]:
     """How many photos convert.py has placed, if it made the scene."""
     path = Path(source) / REPORT
+    if is_unfinished(source):
+        yield Finding("a conversion of this scene was not finished", "train.py finishes it, or run convert.py again")
+    if text := changed_photos(source):
+        yield note(text)
     if not path.is_file():
         return
     try:
         report = read_json(path)
         placed, photos = int(report["registered"]), int(report["photos"])
         advice = [str(line) for line in report["advice"]]
+        verdict = report.get("unusable")
     except (OSError, ValueError, KeyError, TypeError):
         yield Finding(f"{path} is damaged", "remove it, or run convert.py again")
+        return
+    if verdict:
+        yield Finding(
+            f"convert.py says of this scene: {verdict}", "do what its capture.html advises, and convert again"
+        )
         return
     text = f"{placed} of {photos} photos were placed by convert.py"
     remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"

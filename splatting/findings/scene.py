@@ -13,7 +13,7 @@ from scene.readers.info import NEAREST, as_camera_info
 from scene.scene import Scene
 from splatting.findings import Finding, Severity, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
-from splatting.findings.capture import check_conversion, left_out
+from splatting.findings.capture import changed_photos, check_conversion, left_out
 from splatting.findings.fit import check_agreement, check_geometry
 from splatting.findings.photo_files import of_blur, of_damage, of_duplicates
 from splatting.findings.photos import check_views, hints, of_photos
@@ -59,7 +59,7 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
     A resumed training goes on with what its start was told of.
     """
     info, views = scene.info, scene.getTrainCameras()
-    if text := left_out(options.source_path):
+    for text in filter(None, (left_out(options.source_path), changed_photos(options.source_path))):
         print(text)
     if not resumed:
         smallest = min((view.image_width, view.image_height) for view in views)

@@ -8,10 +8,10 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from splatting.files.image_files import PHOTO_SUFFIXES
 from splatting.host.listing import some
 from splatting.sfm.colmap import copy_database, names_in
 from splatting.sfm.images import prepared_names
-from splatting.sfm.inputs import PHOTO_SUFFIXES
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.report import read_survey, read_tried
 from utils.system_utils import UserError

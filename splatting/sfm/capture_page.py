@@ -53,7 +53,6 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
         looks = compared(looks_of(root, image_names(root)), layout)
         report = read_json(layout.report)
         report |= {"seconds": seconds()} | worth(report, survey["photos"], looks)
-        report["unusable"] = unusable(report)
         write_json(layout.report, report)
         write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)
 

@@ -24,7 +24,7 @@ JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
 _LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
 _MOST_NAMED = 20
-_OR_WITHOUT = "or pass --skip_unreadable to go on without photos that cannot be read"
+_OR_WITHOUT = "or pass --skip_unreadable to convert.py to go on without photos that cannot be read"
 # Formats that COLMAP reads, or in which photos of other formats are written for it: HEIC and AVIF lose little as JPEG.
 _WRITTEN = {"JPEG": "JPEG", "MPO": "JPEG", "PNG": "PNG", "TIFF": "TIFF", "BMP": "BMP", "HEIF": "JPEG", "AVIF": "JPEG"}
 _ENDS = {"JPEG": ".jpg", "PNG": ".png", "TIFF": ".tif", "BMP": ".bmp"}

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from PIL import Image
 
 from scene.images.decode import picture_size
-from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
+from splatting.files.image_files import HEIF_SUFFIXES, RAW_SUFFIXES, SUFFIXES, UNREADABLE, VIDEO_SUFFIXES, open_image
 from splatting.files.plain_files import not_the_file, plain
 from splatting.host.listing import some
 from utils.system_utils import UserError
@@ -29,15 +29,7 @@ _HEIF = (
     b"avif",
     b"avis",
 )  # brands of ISO files
-_HEIF_SUFFIXES = (".heic", ".heif", ".hif", ".avif")
-_RAW_SUFFIXES = (
-    *(".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".sr2", ".raf", ".orf", ".rw2", ".pef", ".srw", ".3fr", ".iiq"),
-    *(".gpr", ".rwl", ".x3f"),
-)
-# Of files that are taken for photos before they are opened; those that cannot be used are named later.
-PHOTO_SUFFIXES = (*SUFFIXES, *_HEIF_SUFFIXES, *_RAW_SUFFIXES, ".jp2", ".tga", ".ppm")
 _DNG_VERSION = 50706  # TIFF tag: a RAW file, whose first picture is a thumbnail
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".m2ts", ".mpg", ".3gp", ".insv", ".wmv")
 _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM; MPEG program streams
 # Formats whose files often lie beside a JPEG of the same shot.
 _OFTEN_DOUBLE = ("HEIF", "AVIF", "RAW")
@@ -58,13 +50,15 @@ class Inputs(NamedTuple):
     unused: dict[str, str]
 
 
-def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path] = ()) -> Inputs:
+def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path] = (), below: bool = True) -> Inputs:
     """Tell the photos below a folder from its other files; hidden ones, and those of `but`, count as absent.
 
     skip_unreadable: leave out photos that cannot be read, also damaged ones; else a UserError names them by reason.
+    below: look into sub-folders, too.
     """
     absent = {path.absolute() for path in but}
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file() or path.is_symlink()]
+    paths = folder.rglob("*") if below else (path for path in folder.iterdir() if not path.is_dir())
+    files = [path for path in sorted(paths) if path.is_file() or path.is_symlink()]
     seen = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
     kinds = {path: _kind(path, skip_unreadable) for path in seen if path.absolute() not in absent}
     stems = {path.with_suffix(""): path.name for path, kind in kinds.items() if kind.format not in (*_OFTEN_DOUBLE, "")}
@@ -83,7 +77,7 @@ def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path]
         listed = "; ".join(f"{some(names)} ({reason})" for reason, names in unreadable.items())
         raise UserError(
             f"{sum(map(len, unreadable.values()))} photos in {folder} cannot be read: {listed}; follow these hints, or "
-            "pass --skip_unreadable to leave them out"
+            "pass --skip_unreadable to convert.py, which leaves them out"
         )
     return Inputs(sorted(photos), unused)
 
@@ -114,7 +108,7 @@ def _kind(path: Path, thorough: bool) -> _Kind:
             head += file.read(_HEAD) if brand in _HEIF else b""
     except OSError as error:
         return _Kind("unknown", f"{error.strerror}: make it readable")
-    if suffix in _RAW_SUFFIXES or brand == b"crx ":
+    if suffix in RAW_SUFFIXES or brand == b"crx ":
         return _Kind("RAW", _DEVELOP)
     if brand in _HEIF:
         return _heif_kind(path, head, thorough)
@@ -171,7 +165,7 @@ def _picture_kind(path: Path, thorough: bool) -> _Kind:
         if suffix in SUFFIXES:
             other = not_the_file(path)
             return _Kind("unknown", (f"{other}: download it again" if other else _DAMAGED) if thorough else "")
-        return _Kind("HEIF", _DAMAGED) if suffix in _HEIF_SUFFIXES else _Kind("", "no picture")
+        return _Kind("HEIF", _DAMAGED) if suffix in HEIF_SUFFIXES else _Kind("", "no picture")
     return _Kind("", "GIF, the format of animations") if kind == "GIF" else _Kind(kind, "")
 
 

@@ -1,15 +1,22 @@
 """Paths of a conversion, and checks of the folder that is given, with messages that name the fix."""
 
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from scene.readers.scene_folder import is_scene
-from splatting.files.image_files import SUFFIXES
+from scene.readers.scene_folder import (
+    FEWEST,
+    WORK,
+    find_capture,
+    how_to_convert,
+    scene_above,
+    visible_files,
+)
+from splatting.files.image_files import PHOTO_SUFFIXES, SUFFIXES, VIDEO_SUFFIXES
 from splatting.files.similarity import FILE
-from splatting.sfm.inputs import VIDEO_SUFFIXES, Inputs, sort_inputs, unused_lines
+from splatting.host.listing import some
+from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
 from utils.system_utils import UserError
-
-FEWEST = 3
 
 
 class Layout:
@@ -20,7 +27,7 @@ class Layout:
         self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
         self.report, self.page = scene / "convert_report.json", scene / "capture.html"
         self.orientation = scene / FILE
-        self.work = work = scene / "distorted"
+        self.work = work = scene / WORK
         self.prepared = work / "photos"  # for COLMAP: upright, in formats that it reads
         self.small = work / "small"  # copies of those, in which features are found
         self.masks, self.undistorted = work / "masks", work / "undistorted"
@@ -60,6 +67,29 @@ def scene_folder(given: str, made: bool = False) -> Path:
     return folder.absolute()
 
 
+def take_photos_beside(layout: Layout, is_video: bool) -> None:
+    """Let photos that lie in the scene folder itself be the input, if `input` has no files; else name them.
+
+    is_video: frames of a video will be written into `input`. UserError if `input` is no folder, or where nothing can be
+    written.
+    """
+    if os.path.lexists(layout.input) and not layout.input.is_dir():
+        what = "a file" if layout.input.is_file() else "a link to nothing"
+        raise UserError(f"{layout.input} is {what}; remove it, and make a folder of that name for the photos")
+    for folder in (layout.scene, layout.work):
+        nearest = next(path for path in (folder, *folder.parents) if path.exists())
+        if not os.access(nearest, os.W_OK | os.X_OK):
+            raise UserError(f"{nearest} is read-only; copy the photos to a folder of your own, and pass it as -s")
+    found, here = find_capture(layout.scene), visible_files(layout.scene, layout.scene.glob("*"))
+    beside = {path.name for path in here if path.suffix.lower() in PHOTO_SUFFIXES}
+    if found.place == layout.scene and not is_video:
+        foreign = scene_above(layout.scene) or (layout.scene / "cfg_args").is_file() or layout.scene.name == "input"
+        if beside and (layout.stages.is_file() or not foreign):
+            layout.input = layout.scene
+    elif unused := sorted(beside - {path.name for path in found.photos} if found.place == layout.input else beside):
+        print(f"not used: {some(unused)} (beside the folder input: move them into it)")
+
+
 def find_images(layout: Layout, skip_unreadable: bool = False, but: Iterable[Path] = ()) -> Inputs:
     """Sort the files below `input`, with its sub-folders, as `sort_inputs` does.
 
@@ -67,7 +97,8 @@ def find_images(layout: Layout, skip_unreadable: bool = False, but: Iterable[Pat
     """
     if not layout.input.is_dir():
         raise UserError(_no_input(layout))
-    found = sort_inputs(layout.input, skip_unreadable, but)
+    made = layout.report, layout.page, layout.orientation
+    found = sort_inputs(layout.input, skip_unreadable, (*but, *made), below=layout.input != layout.scene)
     if len(found.photos) < FEWEST:
         raise UserError(
             f"{layout.input}: fewer than {FEWEST} readable photos ({len(found.photos)}); "
@@ -87,20 +118,13 @@ def _no_input(layout: Layout) -> str:
         return f"{scene} is the folder of the photos itself; pass its parent folder as -s: {scene.parent}"
     if (scene / "cfg_args").is_file():
         return f"{scene} is a model that train.py wrote; pass the folder of its photos as -s"
-    if is_scene(scene):
+    if above := scene_above(scene):
         return (
-            f"no folder input in {scene}, which is a scene already: train.py takes it as it is; to convert again, make "
-            f"{layout.input} and put the photos there"
+            f"no folder input in {scene}, which {'is' if above == scene else 'lies in'} a scene already: train.py "
+            f"takes it as it is; to convert again, make {above / 'input'} and put the photos there"
         )
-    beside = sum(map(_is_image, scene.iterdir()))
-    if beside:
-        return (
-            f"no folder input in {scene}, but {beside} photos directly in it; make {layout.input}, move them there, "
-            f"and run again with -s {scene}"
-        )
-    if (scene / "images").is_dir():
-        return f"no folder input in {scene}; rename its folder images to input"
-    return f"no folder input in {scene}; make it and put the photos there, or pass a video as --video"
+    remedy = how_to_convert(scene) or "make it and put the photos there, or pass a video as --video"
+    return f"no folder input in {scene}; {remedy}"
 
 
 def _is_image(path: Path) -> bool:

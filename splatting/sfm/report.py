@@ -5,6 +5,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
+from splatting.findings.capture import unusable
 from splatting.sfm.layout import Layout
 from utils.system_utils import UserError
 
@@ -63,7 +64,7 @@ def lens_words(report: dict[str, Any]) -> str:
 def write_report(
     path: Path, models: Sequence[Model], images: Sequence[str], partners: dict[str, int], **made: Any
 ) -> None:
-    """Write convert_report.json: photos placed and left out, models, and `made`: settings, cameras, advice."""
+    """Write convert_report.json: photos placed and left out, models, the verdict, and `made`: settings, advice, ..."""
     chosen = models[0]
     content = {
         **made,
@@ -76,7 +77,7 @@ def write_report(
         "points": chosen.points,
         "registered": len(chosen.registered),
     }
-    write_json(path, content)
+    write_json(path, {**content, "unusable": unusable(content)})
 
 
 def report_inputs(path: Path, **inputs: Any) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from splatting.files.json_files import read_json, write_json
-from splatting.findings.capture import of_given_poses, of_model, of_shared_cameras, refuse_nothing
+from splatting.findings.capture import of_given_poses, of_model, of_shared_cameras, refuse_nothing, state_of
 from splatting.sfm import cameras, colmap, images, report, video
 from splatting.sfm.adding import base_state
 from splatting.sfm.colmap import Backend, Settings, worker_command
@@ -54,7 +54,10 @@ class Stage(NamedTuple):
 
 
 class StageRecord:
-    """The file stages.json. It has, for each stage begun, a digest of its inputs and whether it was finished."""
+    """The file stages.json. It has, for each stage begun, a digest of its inputs and whether it was finished.
+
+    Notes lie beside them: the options and the photos of the last conversion that began a stage.
+    """
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -66,6 +69,10 @@ class StageRecord:
             except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
                 message = f"{path} is damaged; remove the folder {path.parent} to convert from the beginning"
                 raise UserError(message) from error
+
+    def note(self, name: str, content: Any) -> None:
+        """Write a note, once a stage begins."""
+        self._record[name] = {"made_from": content, "done": True}
 
     def begun(self, name: str) -> bool:
         """Whether this stage was ever begun in this folder."""
@@ -127,7 +134,7 @@ def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
 
     return Stage(
         "video",
-        [[_state(path) for path in videos], count],
+        [[state_of(path) for path in videos], count],
         reset=partial(video.remove_frames, layout),
         work=partial(video.extract_videos, layout, videos, count),
         check=check,
@@ -136,9 +143,9 @@ def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
 
 def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     """Make the stage that puts upright photos and masks into the work folder."""
-    made_from = [[name, _state(layout.input / name)] for name in names]
+    made_from = [[name, state_of(layout.input / name)] for name in names]
     if masks:
-        made_from.append([[str(path), _state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
+        made_from.append([[str(path), state_of(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
 
     return Stage(
         "photos",
@@ -153,7 +160,7 @@ def poses_stage(layout: Layout, source: Path) -> Stage:
     """Make the stage that finds the given poses and cameras of the photos."""
     return Stage(
         "poses",
-        [[str(path), _state(path)] for path in files_of(source)],
+        [[str(path), state_of(path)] for path in files_of(source)],
         reset=lambda: _remove(layout.given),
         work=lambda: write_given(layout, source),
         check=lambda: posed_photos(layout, source) and None,
@@ -258,16 +265,19 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
             found += of_model(models, names, matches, settings.matcher, at_limit, tried, more)
             found += of_shared_cameras(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
         later = [path for name, paths in _written_by(layout).items() if record.begun(name) for path in paths]
-        _remove(layout.images, layout.sparse, layout.report, *later)
-        mkdir_p(layout.sparse)
-        (layout.undistorted / "sparse").rename(layout.sparse / "0")
-        written.rename(layout.images)
-        _remove(layout.undistorted)
+        whole = layout.undistorted / "whole"
+        mkdir_p(whole)
+        (layout.undistorted / "sparse").rename(whole / "0")
         kept = "native" if native else "undistort"
         described = cameras.described(chosen.cameras, lenses)
         made_of = {**made, "advice": [*map(str, found)], "cameras": described, "lenses": kept}
         made_of |= {"more_points": more, "tried": tried}
+        # `sparse` goes first and comes last: what has one has the photos, too, and the report with its verdict.
+        _remove(layout.sparse, layout.images, layout.report, *later)
+        written.rename(layout.images)
         report.write_report(layout.report, models, names, matches, **made_of)
+        whole.rename(layout.sparse)
+        _remove(layout.undistorted)
 
     return Stage("undistortion", [made_from, settings.lenses], lambda: _remove(layout.undistorted), work)
 
@@ -312,7 +322,7 @@ def model_state(layout: Layout) -> list[Any]:
     files = sorted(layout.models.rglob("*.*")) if layout.models.is_dir() else []
     if not files:
         raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; omit the option to make one")
-    return [[str(path.relative_to(layout.models)), *_state(path)] for path in files]
+    return [[str(path.relative_to(layout.models)), *state_of(path)] for path in files]
 
 
 def _registered_since(log: Path) -> Callable[[], int]:
@@ -333,12 +343,6 @@ def _registered_since(log: Path) -> Callable[[], int]:
         return most
 
     return count
-
-
-def _state(path: Path) -> list[Any]:
-    """Describe a file, so that changes show."""
-    stat = path.stat()
-    return [path.name, stat.st_size, stat.st_mtime_ns]
 
 
 def _remove(*paths: Path) -> None:
