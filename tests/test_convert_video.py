@@ -1,5 +1,6 @@
 """convert.py --video: frames chosen by motion and sharpness, HDR brought to SDR, several videos, videos with photos."""
 
+import contextlib
 import json
 import re
 import subprocess
@@ -33,6 +34,10 @@ class _Decoder(SimpleNamespace):
     def frame(number: int) -> Image.Image:
         noise = Image.fromarray(np.random.default_rng(number).integers(0, 256, (30, 40, 3), dtype=np.uint8))
         return noise if number % 3 == 1 else noise.reduce(4).resize((40, 30))
+
+    @staticmethod
+    def get_ffmpeg_exe() -> str:
+        return "false"
 
     @classmethod
     def read_frames(cls, path: str, pix_fmt: str = "rgb24", output_params: list[str] = (), **_: object):
@@ -118,6 +123,12 @@ def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, monkeypa
         layout.frames.write_text(json.dumps([entry | {"names": [name]}]))
         with pytest.raises(UserError, match="frames.json is damaged; remove "):
             video_module.remove_frames(layout)
+    for key in entry:
+        for broken in ({name: value for name, value in entry.items() if name != key}, entry | {key: [[]]}):
+            layout.frames.write_text(json.dumps([broken]))
+            with contextlib.suppress(UserError):  # what it need not have
+                video_module.video_lines(layout)
+                video_module.report_entries(layout)
     assert _frame_elsewhere.is_file()
     layout.frames.write_text(json.dumps([entry]))
     Image.open(frames[1]).rotate(90).save(frames[1])
@@ -174,6 +185,42 @@ def test_a_text_does_not_lead_to_other_files(ffmpeg, room, tmp_path, text, endin
     with pytest.raises(UserError, match="cannot read the video .*a.m"):
         _extract(tmp_path / "scene", tmp_path / f"a.{ending}", 2)
     assert not list((tmp_path / "scene" / "input").iterdir())
+
+
+def _streams(ffmpeg, room, path: Path, *heights: int, width: int = 240) -> None:
+    """Write a video with a stream of each height, the first of which players show; each begins later in the room."""
+    command, given = [ffmpeg.get_ffmpeg_exe(), "-loglevel", "error"], []
+    for number, height in enumerate(heights):
+        part = path.with_name(f"{path.stem}_{number}.mkv")
+        _write(ffmpeg, part, room[4 * number :][:4], "-vf", f"scale={width * height // 180}:{height}", "-crf", "12")
+        command, given = [*command, "-i", str(part)], [*given, "-map", f"{number}:v"]
+    subprocess.run([*command, *given, "-c", "copy", "-f", "mp4", str(path)], check=True)
+
+
+@pytest.mark.parametrize(
+    ("heights", "folders", "said"),
+    [
+        ((48, 180), {"": 1}, "of its 2 streams, the largest is taken"),
+        ((180, 48), {"": 0}, "of its 2 streams, the largest is taken"),
+        ((180, 180), {"walk": 0, "walk_2": 1}, "each of its 2 streams of 240 x 180 is a camera"),
+        ((48, 180, 180), {"walk": 1, "walk_2": 2}, "each of its 2 streams of 240 x 180 is a camera"),
+    ],
+)
+def test_streams_of_a_video(ffmpeg, room, tmp_path, heights, folders, said):
+    _streams(ffmpeg, room, tmp_path / "walk.mp4", *heights)
+    layout = _extract(tmp_path / "scene", tmp_path / "walk.mp4", 9)
+    for name, first in folders.items():
+        taken = [np.asarray(Image.open(path)) for path in sorted((layout.input / name).iterdir())]
+        assert _places(room, taken) == list(range(4 * first, 4 * first + 4))
+    lines = video_module.video_lines(layout)
+    assert len(lines) == len(folders) and all(said in line for line in lines)
+
+
+def test_parts_of_a_panorama_are_refused(ffmpeg, room, tmp_path):
+    _streams(ffmpeg, room, tmp_path / "GS01.360", 60, 60, width=480)
+    with pytest.raises(UserError, match=r"GS01.360 has parts of a panorama in 2 streams; export .*GoPro Player"):
+        convert.main(["-s", str(tmp_path / "scene"), "--video", str(tmp_path / "GS01.360")])
+    assert not (tmp_path / "scene").exists()
 
 
 def test_frames_follow_the_motion(ffmpeg, room, tmp_path):

@@ -4,13 +4,14 @@ ffmpeg reads each video twice: first as grey pictures, which tell motion and sha
 """
 
 import logging
+import math
 import os
 import re
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -30,6 +31,9 @@ _ONE_FILE = [
     "rm",
 ]
 PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
+# Of ffmpeg's description of a file: number, codec, colours and size of a stream that is no cover picture.
+_STREAM = re.compile(r"^ *Stream #0:(\d+).*?: Video: (?!.*\(attached pic\))(.*?), (.*?), (\d+)x(\d+)\b", re.MULTILINE)
+_HALF = 2.5  # width by height, from which on a stream is half of a panorama; a lens has 1 to 2
 _NAME = re.compile(r"([^/.][^/]*/)?frame_\d{5,}\.jpg")  # below `input`, which a record of others may not leave
 # Difference, as of `_differ`, between frames that follow each other: photos of fox_raw, monstree_raw and bonsai_full
 # reach it when they move by 0.3 to 0.6 % of their width; strong noise (6 of 255 levels) reaches 0.03.
@@ -52,6 +56,50 @@ NOTE = "test views of --eval lie between frames of the same video that train; ot
 FRAMES_MISSING = "an earlier run ended before it had all frames of its video; pass that --video again to add the others"
 
 
+class Stream(NamedTuple):
+    """A stream of a video that has several. text: what to say of the choice."""
+
+    number: int
+    codec: str
+    colours: str
+    text: str
+
+
+def find_streams(video: Path) -> list[Stream | None]:
+    """Return the streams to take frames of: the largest, or all of that size, as of two lenses; None: the only one.
+
+    UserError for parts of a panorama, which no lens has taken.
+    """
+    try:
+        command = [find_decoder().get_ffmpeg_exe(), "-hide_banner", *_ONE_FILE, "-i", _address(video)]
+        said = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
+    except (OSError, RuntimeError):  # reading the frames will tell
+        return [None]
+    found = [(int(n), codec, colours, (int(w), int(h))) for n, codec, colours, w, h in _STREAM.findall(said)]
+    if len(found) < 2:
+        return [None]
+    width, height = size = max((stream[-1] for stream in found), key=math.prod)
+    taken = [stream for stream in found if stream[-1] == size]
+    text = f"of its {len(found)} streams, the largest is taken"
+    if len(taken) > 1:
+        text = (
+            f"each of its {len(taken)} streams of {width} x {height} is a camera (of fisheyes: --camera OPENCV_FISHEYE)"
+        )
+        if width >= _HALF * height:
+            raise UserError(
+                f"{video} has parts of a panorama in {len(taken)} streams; export it as one equirectangular video with "
+                "the program of the camera's maker (for .360: GoPro Player), and pass that"
+            )
+    return [Stream(*stream[:-1], text) for stream in taken]
+
+
+def _pieces(layout: Layout, videos: Sequence[Path]) -> list[tuple[Path, Stream | None, Path]]:
+    """Return each video with each stream that is taken, and the folder of its frames."""
+    pieces = [(video, stream) for video in videos for stream in find_streams(video)]
+    folders = frame_folders(layout, [video for video, _ in pieces])
+    return [(*piece, folder) for piece, folder in zip(pieces, folders, strict=True)]
+
+
 def find_decoder() -> Any:
     """Return the package that reads videos. UserError if it is not installed."""
     forget_relative_path()  # as imageio-ffmpeg looks there, too
@@ -68,7 +116,10 @@ def find_decoder() -> Any:
 
 
 def frame_folders(layout: Layout, videos: Sequence[Path]) -> list[Path]:
-    """The folder of each video's frames: `input` of one alone, of several a sub-folder each, named by the video."""
+    """The folder of each video's frames: `input` of one alone, of several a sub-folder each, named by the video.
+
+    A video stands there once for each of its streams.
+    """
     if len(videos) == 1:
         return [layout.input]
     stems = [video.stem.lstrip(".") or "video" for video in videos]  # hidden folders are not looked into
@@ -86,7 +137,7 @@ def taken_frames(layout: Layout) -> set[str]:
 def refuse_foreign_frames(layout: Layout, videos: Sequence[Path]) -> None:
     """Raise UserError if a file that is no frame of an earlier run has a name that frames may get."""
     ours = {layout.input / name for name in taken_frames(layout)}
-    for folder, video in zip(frame_folders(layout, videos), videos, strict=True):
+    for video, _, folder in _pieces(layout, videos):
         foreign = [path for path in sorted(folder.glob(PATTERN)) if not (path in ours and is_ours(path))]
         if foreign:
             raise UserError(
@@ -105,9 +156,9 @@ def remove_frames(layout: Layout) -> None:
 
 def extract_videos(layout: Layout, videos: Sequence[Path], count: int) -> None:
     """Write at most `count` frames of each video below `input`, and `frames.json`, which says what they are."""
-    for video, folder in zip(videos, frame_folders(layout, videos), strict=True):
+    for video, stream, folder in _pieces(layout, videos):
         mkdir_p(folder)
-        extract_frames(layout, video, folder, count)
+        extract_frames(layout, video, folder, count, stream)
 
 
 def report_entries(layout: Layout) -> list[dict[str, Any]]:
@@ -132,14 +183,16 @@ def video_lines(layout: Layout) -> list[str]:
 def _record(layout: Layout) -> list[dict[str, Any]]:
     try:
         record = read_json(layout.frames) if layout.frames.is_file() else []
-        if not all(_NAME.fullmatch(name) for entry in record for name in entry["names"]):
-            raise ValueError
+        for entry in record:
+            sound = all(map(_NAME.fullmatch, entry["names"])) and all(map(str.isprintable, entry.get("made", ())))
+            if [type(entry[key]) for key in ("video", "frames", "asked", "hdr")] != [str, int, int, str] or not sound:
+                raise ValueError
         return record
     except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
         raise UserError(f"{layout.frames} is damaged; remove {layout.work} to convert from the beginning") from error
 
 
-def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> None:
+def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream: Stream | None = None) -> None:
     """Write at most `count` upright frames of a video into `folder` as frame_00001.jpg, ...; add it to frames.json.
 
     The frames are those of `choose_frames`. UserError if the video cannot be read.
@@ -147,10 +200,11 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
     decoder = find_decoder()
     try:
         sharp, small = [], []
-        header = next(decoder.read_frames(_address(video), input_params=_ONE_FILE))
-        colours = header["pix_fmt"]
-        fields = _of_fields(colours, header.get("codec", ""))
-        options = ["-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
+        chosen_stream = ["-map", f"0:{stream.number}"] if stream else []
+        header = next(decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=chosen_stream))
+        codec, colours = (stream.codec, stream.colours) if stream else (header.get("codec", ""), header["pix_fmt"])
+        fields = _of_fields(colours, codec)
+        options = [*chosen_stream, "-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
         grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
         reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options, **grey)
         width, height = next(reader)["size"]
@@ -162,7 +216,7 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
         if not small:
             raise RuntimeError("it has no frames")
         if expected and len(small) < _WHOLE * expected:
-            _warn_if_cut(decoder, video, header["duration"])
+            _warn_if_cut(decoder, video, header["duration"], stream.number if stream else "v:0")
         chosen = choose_frames(sharp, np.stack(small), count)
         hdr = next((name for tag, name in _HDR.items() if tag in colours), "")
         filters = _filters(decoder, video, colours, bool(hdr))
@@ -170,11 +224,12 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int) -> Non
         names = [path.relative_to(layout.input).as_posix() for path in paths]
         entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
         stored = "{} x {}".format(*header["size"])
-        entry["made"] = ["it is interlaced, so one of two fields makes each frame"] if fields else []
+        entry["made"] = [stream.text] if stream else []
+        entry["made"] += ["it is interlaced, so one of two fields makes each frame"] if fields else []
         if (width, height) != tuple(header["size"]):
             entry["made"].append(f"its pixels are not square, so {stored} became {width} x {height}")
         write_json(layout.frames, [*_record(layout), entry])
-        for path, frame in zip(paths, _read(decoder, video, chosen, fields, filters), strict=True):
+        for path, frame in zip(paths, _read(decoder, video, chosen, chosen_stream, fields, filters), strict=True):
             write_picture(path, Image.fromarray(frame), quality=JPEG_QUALITY, subsampling=0)
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         reason = str(error).strip().splitlines()
@@ -191,9 +246,9 @@ def _address(video: Path) -> str:
     return os.path.abspath(video)
 
 
-def _warn_if_cut(decoder: Any, video: Path, duration: float) -> None:
+def _warn_if_cut(decoder: Any, video: Path, duration: float, stream: int | str) -> None:
     """Say where the frames of a video end before its duration (seconds); fewer of them may only be far apart."""
-    copied = ["-map", "0:v:0", "-c", "copy", "-f", "null", "-", "-v", "quiet", "-nostats", "-progress", "-"]
+    copied = ["-map", f"0:{stream}", "-c", "copy", "-f", "null", "-", "-v", "quiet", "-nostats", "-progress", "-"]
     command = [decoder.get_ffmpeg_exe(), *_ONE_FILE, "-i", _address(video), *copied]
     said = subprocess.run(command, capture_output=True, text=True, errors="replace").stdout
     ends = [int(number) / 1e6 for number in re.findall(r"out_time_us=(\d+)", said)]
@@ -291,11 +346,14 @@ def _of_fields(colours: str, codec: str = "") -> list[str]:
 
 
 def _read(
-    decoder: Any, video: Path, numbers: Sequence[int], before: Sequence[str], filters: Sequence[str]
+    decoder: Any, video: Path, numbers: Sequence[int], stream: list[str], before: list[str], filters: list[str]
 ) -> Iterator[np.ndarray]:
-    """Yield the frames (H, W, 3) uint8 of these numbers. before: filters that need the frames around them."""
+    """Yield the frames (H, W, 3) uint8 of these numbers.
+
+    stream: options that choose it. before: filters that need the frames around them.
+    """
     chain = ",".join([*before, f"select={_any(numbers)}", _SQUARE, *filters])
-    options = ["-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
+    options = [*stream, "-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
     reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options)
     width, height = next(reader)["size"]
     for data in reader:
