@@ -13,6 +13,7 @@ if __name__ == "__main__":
     import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
 
 import argparse
+import json
 import os
 import shlex
 import sys
@@ -22,7 +23,7 @@ from typing import Any
 
 from arguments import OptionParser
 from scene.readers.scene_folder import WORK, find_capture, is_apart, is_scene
-from splatting.findings.capture import is_unfinished, lines_of, stages_of, state_of, training_options, unusable
+from splatting.findings.capture import lines_of, stages_of, state_of, training_options, unusable
 from splatting.host import torchrun
 from splatting.host.listing import some
 from splatting.host.start import typed_command
@@ -32,14 +33,7 @@ from splatting.sfm.cameras import MODES
 from splatting.sfm.capture_page import capture_stage
 from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
 from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
-from splatting.sfm.layout import (
-    FEWEST,
-    Layout,
-    find_images,
-    refuse_foreign_results,
-    scene_folder,
-    take_photos_beside,
-)
+from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder, take_photos_beside
 from splatting.sfm.orienting import said_of
 from splatting.sfm.programs import refuse_while_working
 from splatting.sfm.report import lens_words, report_inputs, summary
@@ -130,7 +124,7 @@ def convert_first(source: str) -> None:
     found = find_capture(folder.absolute())
     words, begun = ["--video", *map(str, found.videos)] if found.is_video else [], None
     odd = found.place != folder.absolute() or os.path.lexists(folder / "input") and not (folder / "input").is_dir()
-    if is_unfinished(folder):
+    if stages_of(folder):
         there = f"; to train what is there, remove {folder / WORK}" if is_scene(folder) else ""
         print(f"a conversion of {folder} was not finished: finishing it first{there}")
         begun = _begun_options(folder)
@@ -264,7 +258,11 @@ def main(argv: Sequence[str] | None = None, **options: Any) -> None:
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
-    convert(layout, _settings(args), args)
+    try:
+        convert(layout, _settings(args), args)
+    except json.JSONDecodeError as error:
+        fault = f"a file of the conversion in {layout.scene} is damaged ({error})"
+        raise UserError(f"{fault}; remove {layout.work} to convert from the beginning") from error
 
 
 if __name__ == "__main__":

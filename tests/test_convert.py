@@ -23,7 +23,7 @@ from splatting.findings.capture import check_conversion, is_unfinished, left_out
 from splatting.sfm import capture_page, stages
 from splatting.sfm.colmap import Pycolmap, Settings
 from splatting.sfm.images import check_images, prepare_images
-from splatting.sfm.layout import Layout
+from splatting.sfm.layout import Layout, refuse_foreign_results
 from splatting.sfm.stages import reconstruction_stages
 from utils.system_utils import UserError
 
@@ -341,6 +341,12 @@ def test_a_verdict_outlives_an_interruption_and_train_finishes_what_was_begun(co
         train.main(["-s", str(copy), "-m", str(copy / "out")])
     report = json.loads((copy / "convert_report.json").read_text())
     assert (report["lenses"], report["unusable"]) == ("undistort", None) and not is_unfinished(copy)
+    (copy / "convert_report.json").write_text("{")
+    with pytest.raises(UserError, match="is damaged .*; remove .*distorted to convert from the beginning"):
+        convert.main([*again, "undistort"])
+    (copy / "convert_report.json").write_text(json.dumps(report))
+    shutil.rmtree(copy / "distorted")
+    refuse_foreign_results(Layout(copy), False, False, False)  # as the line says
 
 
 def test_masks_keep_features_away(converted, tmp_path):

@@ -202,8 +202,8 @@ def _streams(ffmpeg, room, path: Path, *heights: int, width: int = 240) -> None:
     [
         ((48, 180), {"": 1}, "of its 2 streams, the largest is taken"),
         ((180, 48), {"": 0}, "of its 2 streams, the largest is taken"),
-        ((180, 180), {"walk": 0, "walk_2": 1}, "each of its 2 streams of 240 x 180 is a camera"),
-        ((48, 180, 180), {"walk": 1, "walk_2": 2}, "each of its 2 streams of 240 x 180 is a camera"),
+        ((180, 180), {"walk": 0, "walk_2": 1}, "each of its 2 streams of one size is a camera"),
+        ((48, 180, 180), {"walk": 1, "walk_2": 2}, "each of its 2 streams of one size is a camera"),
     ],
 )
 def test_streams_of_a_video(ffmpeg, room, tmp_path, heights, folders, said):

@@ -248,6 +248,14 @@ def test_a_conversion_is_finished_with_its_own_options(tmp_path, monkeypatch):
     assert calls == [(plain, given), (plain, {}), (plain, {})] and not is_unfinished(tmp_path)
 
 
+def test_a_stage_whose_results_were_removed_is_done_again(tmp_path):
+    record, made = StageRecord(tmp_path / "stages.json"), tmp_path / "made"
+    stages = [Stage("one", 1, lambda: None, made.touch, makes=[made]), Stage("two", 1, lambda: None, lambda: None)]
+    assert [record.run(stages), record.run(stages)] == [[], ["one", "two"]]
+    made.unlink()
+    assert record.run(stages) == [] and made.exists()
+
+
 def test_photos_that_change_after_a_conversion_are_named(tmp_path):
     _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", "capture.html", size=1)
     (tmp_path / REPORT).write_text('{"unused": {"live.CR2": "same name"}}')

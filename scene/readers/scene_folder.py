@@ -57,11 +57,12 @@ def is_apart(folder: Path) -> bool:
 
 
 class Capture(NamedTuple):
-    """What a folder without cameras has: where photos and videos lie, `input` or the folder itself, and both."""
+    """What a folder has: where photos and videos lie, `input` or the folder itself, both, and the photos in itself."""
 
     place: Path
     photos: list[Path]
     videos: list[Path]
+    beside: list[Path]
 
     @property
     def is_video(self) -> bool:
@@ -73,15 +74,16 @@ class Capture(NamedTuple):
 def find_capture(folder: Path) -> Capture:
     """Find the photos and videos of a folder by their names, without hidden ones and the videos of Live Photos."""
     place = folder / "input"
-    files = visible_files(place, place.rglob("*"))
-    if not files:
-        place, files = folder, visible_files(folder, folder.glob("*"))
-    photos, videos = ([path for path in files if path.suffix.lower() in s] for s in (PHOTO_SUFFIXES, VIDEO_SUFFIXES))
+    here, inner = _visible(folder, folder.glob("*")), _visible(place, place.rglob("*"))
+    photos = [path for path in inner or here if path.suffix.lower() in PHOTO_SUFFIXES]
     stills = {path.with_suffix("") for path in photos} if len(photos) >= FEWEST else set()
-    return Capture(place, photos, [path for path in videos if path.with_suffix("") not in stills])
+    videos = [path for path in inner or here if path.suffix.lower() in VIDEO_SUFFIXES]
+    videos = [path for path in videos if path.with_suffix("") not in stills]
+    beside = [path for path in here if path.suffix.lower() in PHOTO_SUFFIXES]
+    return Capture(place if inner else folder, photos, videos, beside)
 
 
-def visible_files(folder: Path, paths: Iterable[Path]) -> list[Path]:
+def _visible(folder: Path, paths: Iterable[Path]) -> list[Path]:
     """The files among the paths below a folder, sorted, without hidden ones and those in hidden folders."""
     seen = (path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))
     return sorted(path for path in seen if path.is_file())

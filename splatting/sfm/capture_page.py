@@ -56,7 +56,7 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
         write_json(layout.report, report)
         write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)
 
-    return Stage("capture", list(names), lambda: None, work)
+    return Stage("capture", list(names), lambda: None, work, makes=[layout.page])
 
 
 def write_page(

@@ -17,18 +17,8 @@ from splatting.host.listing import some
 from utils.system_utils import UserError
 
 _HEAD = 1 << 16  # bytes that hold the colours of a HEIC or AVIF file
-_HEIF = (
-    b"heic",
-    b"heix",
-    b"heim",
-    b"heis",
-    b"hevc",
-    b"hevx",
-    b"mif1",
-    b"msf1",
-    b"avif",
-    b"avis",
-)  # brands of ISO files
+# Brands of ISO files.
+_HEIF = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis")
 _DNG_VERSION = 50706  # TIFF tag: a RAW file, whose first picture is a thumbnail
 _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM; MPEG program streams
 # Formats whose files often lie beside a JPEG of the same shot.

@@ -4,15 +4,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from scene.readers.scene_folder import (
-    FEWEST,
-    WORK,
-    find_capture,
-    how_to_convert,
-    scene_above,
-    visible_files,
-)
-from splatting.files.image_files import PHOTO_SUFFIXES, SUFFIXES, VIDEO_SUFFIXES
+from scene.readers.scene_folder import FEWEST, WORK, find_capture, how_to_convert, scene_above
+from splatting.files.image_files import SUFFIXES, VIDEO_SUFFIXES
 from splatting.files.similarity import FILE
 from splatting.host.listing import some
 from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
@@ -80,13 +73,14 @@ def take_photos_beside(layout: Layout, is_video: bool) -> None:
         nearest = next(path for path in (folder, *folder.parents) if path.exists())
         if not os.access(nearest, os.W_OK | os.X_OK):
             raise UserError(f"{nearest} is read-only; copy the photos to a folder of your own, and pass it as -s")
-    found, here = find_capture(layout.scene), visible_files(layout.scene, layout.scene.glob("*"))
-    beside = {path.name for path in here if path.suffix.lower() in PHOTO_SUFFIXES}
+    found = find_capture(layout.scene)
     if found.place == layout.scene and not is_video:
         foreign = scene_above(layout.scene) or (layout.scene / "cfg_args").is_file() or layout.scene.name == "input"
-        if beside and (layout.stages.is_file() or not foreign):
+        if found.photos and (layout.stages.is_file() or not foreign):
             layout.input = layout.scene
-    elif unused := sorted(beside - {path.name for path in found.photos} if found.place == layout.input else beside):
+        return
+    used = {path.name for path in found.photos if found.place == layout.input}
+    if unused := [path.name for path in found.beside if path.name not in used]:
         print(f"not used: {some(unused)} (beside the folder input: move them into it)")
 
 
@@ -143,6 +137,7 @@ def refuse_foreign_results(layout: Layout, scene_made: bool, work_made: bool, sk
     """
     forms = dict.fromkeys((layout.images, layout.sparse, layout.orientation))
     forms |= {layout.report: '"left_out"', layout.page: "<title>Capture: "}
+    scene_made = scene_made or _has(layout.report, forms[layout.report])  # of a run whose work folder was removed
     there = [] if scene_made else [path.name for path, form in forms.items() if path.exists() and not _has(path, form)]
     owned = (
         work_made

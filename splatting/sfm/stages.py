@@ -43,6 +43,7 @@ class Stage(NamedTuple):
     made_from: JSON of everything that its result depends on, besides the earlier stages. reset: removes results that
     become invalid when this or an earlier stage is done again. check: raises UserError for unusable inputs, before
     anything is removed. resumable: `work` can resume an interrupted run with the same inputs, without a reset.
+    makes: what is in the scene once it is done; if that was removed, the stage is done again.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Stage(NamedTuple):
     work: Callable[[], None]
     resumable: bool = False
     check: Callable[[], None] = lambda: None
+    makes: Sequence[Path] = ()
 
 
 class StageRecord:
@@ -97,7 +99,7 @@ class StageRecord:
             digest = hashlib.sha256(text.encode()).hexdigest()[:16]
             before = self._record.get(stage.name, {})
             same = before.get("made_from") == digest
-            if same and before["done"]:
+            if same and before["done"] and all(path.exists() for path in stage.makes):
                 kept.append(stage.name)
                 continue
             stage.check()
@@ -279,7 +281,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         whole.rename(layout.sparse)
         _remove(layout.undistorted)
 
-    return Stage("undistortion", [made_from, settings.lenses], lambda: _remove(layout.undistorted), work)
+    reset, makes = partial(_remove, layout.undistorted), [layout.images, layout.report, layout.sparse / "0"]
+    return Stage("undistortion", [made_from, settings.lenses], reset, work, makes=makes)
 
 
 def resize_stage(layout: Layout) -> Stage:

@@ -57,43 +57,40 @@ FRAMES_MISSING = "an earlier run ended before it had all frames of its video; pa
 
 
 class Stream(NamedTuple):
-    """A stream of a video that has several. text: what to say of the choice."""
+    """A stream of a video, if that has several: options that choose it, what differs in the header, what to say."""
 
-    number: int
-    codec: str
-    colours: str
-    text: str
+    options: list[str]
+    header: dict[str, str]
+    said: list[str]
 
 
-def find_streams(video: Path) -> list[Stream | None]:
-    """Return the streams to take frames of: the largest, or all of that size, as of two lenses; None: the only one.
+def find_streams(video: Path) -> list[Stream]:
+    """Find the streams to take frames of: the largest, or all of that size, as of two lenses.
 
     UserError for parts of a panorama, which no lens has taken.
     """
     try:
         command = [find_decoder().get_ffmpeg_exe(), "-hide_banner", *_ONE_FILE, "-i", _address(video)]
-        said = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
+        described = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
     except (OSError, RuntimeError):  # reading the frames will tell
-        return [None]
-    found = [(int(n), codec, colours, (int(w), int(h))) for n, codec, colours, w, h in _STREAM.findall(said)]
+        described = ""
+    found = _STREAM.findall(described)
     if len(found) < 2:
-        return [None]
-    width, height = size = max((stream[-1] for stream in found), key=math.prod)
-    taken = [stream for stream in found if stream[-1] == size]
-    text = f"of its {len(found)} streams, the largest is taken"
+        return [Stream([], {}, [])]
+    size = max(((int(width), int(height)) for *_, width, height in found), key=math.prod)
+    taken = [stream for stream in found if (int(stream[3]), int(stream[4])) == size]
+    said = f"of its {len(found)} streams, the largest is taken"
     if len(taken) > 1:
-        text = (
-            f"each of its {len(taken)} streams of {width} x {height} is a camera (of fisheyes: --camera OPENCV_FISHEYE)"
-        )
-        if width >= _HALF * height:
+        said = f"each of its {len(taken)} streams of one size is a camera (of fisheyes: --camera OPENCV_FISHEYE)"
+        if size[0] >= _HALF * size[1]:
             raise UserError(
                 f"{video} has parts of a panorama in {len(taken)} streams; export it as one equirectangular video with "
                 "the program of the camera's maker (for .360: GoPro Player), and pass that"
             )
-    return [Stream(*stream[:-1], text) for stream in taken]
+    return [Stream(["-map", f"0:{k}"], {"codec": codec, "pix_fmt": kind}, [said]) for k, codec, kind, *_ in taken]
 
 
-def _pieces(layout: Layout, videos: Sequence[Path]) -> list[tuple[Path, Stream | None, Path]]:
+def _pieces(layout: Layout, videos: Sequence[Path]) -> list[tuple[Path, Stream, Path]]:
     """Return each video with each stream that is taken, and the folder of its frames."""
     pieces = [(video, stream) for video in videos for stream in find_streams(video)]
     folders = frame_folders(layout, [video for video, _ in pieces])
@@ -192,7 +189,7 @@ def _record(layout: Layout) -> list[dict[str, Any]]:
         raise UserError(f"{layout.frames} is damaged; remove {layout.work} to convert from the beginning") from error
 
 
-def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream: Stream | None = None) -> None:
+def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream: Stream) -> None:
     """Write at most `count` upright frames of a video into `folder` as frame_00001.jpg, ...; add it to frames.json.
 
     The frames are those of `choose_frames`. UserError if the video cannot be read.
@@ -200,11 +197,11 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
     decoder = find_decoder()
     try:
         sharp, small = [], []
-        chosen_stream = ["-map", f"0:{stream.number}"] if stream else []
-        header = next(decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=chosen_stream))
-        codec, colours = (stream.codec, stream.colours) if stream else (header.get("codec", ""), header["pix_fmt"])
-        fields = _of_fields(colours, codec)
-        options = [*chosen_stream, "-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
+        told = next(decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=stream.options))
+        header = told | stream.header
+        colours = header["pix_fmt"]
+        fields = _of_fields(colours, header.get("codec", ""))
+        options = [*stream.options, "-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
         grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
         reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options, **grey)
         width, height = next(reader)["size"]
@@ -216,7 +213,7 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
         if not small:
             raise RuntimeError("it has no frames")
         if expected and len(small) < _WHOLE * expected:
-            _warn_if_cut(decoder, video, header["duration"], stream.number if stream else "v:0")
+            _warn_if_cut(decoder, video, header["duration"], stream.options)
         chosen = choose_frames(sharp, np.stack(small), count)
         hdr = next((name for tag, name in _HDR.items() if tag in colours), "")
         filters = _filters(decoder, video, colours, bool(hdr))
@@ -224,12 +221,11 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
         names = [path.relative_to(layout.input).as_posix() for path in paths]
         entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
         stored = "{} x {}".format(*header["size"])
-        entry["made"] = [stream.text] if stream else []
-        entry["made"] += ["it is interlaced, so one of two fields makes each frame"] if fields else []
+        entry["made"] = stream.said + ["it is interlaced, so one of two fields makes each frame"] * bool(fields)
         if (width, height) != tuple(header["size"]):
             entry["made"].append(f"its pixels are not square, so {stored} became {width} x {height}")
         write_json(layout.frames, [*_record(layout), entry])
-        for path, frame in zip(paths, _read(decoder, video, chosen, chosen_stream, fields, filters), strict=True):
+        for path, frame in zip(paths, _read(decoder, video, chosen, stream, fields, filters), strict=True):
             write_picture(path, Image.fromarray(frame), quality=JPEG_QUALITY, subsampling=0)
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         reason = str(error).strip().splitlines()
@@ -246,9 +242,21 @@ def _address(video: Path) -> str:
     return os.path.abspath(video)
 
 
-def _warn_if_cut(decoder: Any, video: Path, duration: float, stream: int | str) -> None:
+def _warn_if_cut(decoder: Any, video: Path, duration: float, options: list[str]) -> None:
     """Say where the frames of a video end before its duration (seconds); fewer of them may only be far apart."""
-    copied = ["-map", f"0:{stream}", "-c", "copy", "-f", "null", "-", "-v", "quiet", "-nostats", "-progress", "-"]
+    copied = [
+        *(options or ("-map", "0:v:0")),
+        "-c",
+        "copy",
+        "-f",
+        "null",
+        "-",
+        "-v",
+        "quiet",
+        "-nostats",
+        "-progress",
+        "-",
+    ]
     command = [decoder.get_ffmpeg_exe(), *_ONE_FILE, "-i", _address(video), *copied]
     said = subprocess.run(command, capture_output=True, text=True, errors="replace").stdout
     ends = [int(number) / 1e6 for number in re.findall(r"out_time_us=(\d+)", said)]
@@ -346,14 +354,11 @@ def _of_fields(colours: str, codec: str = "") -> list[str]:
 
 
 def _read(
-    decoder: Any, video: Path, numbers: Sequence[int], stream: list[str], before: list[str], filters: list[str]
+    decoder: Any, video: Path, numbers: Sequence[int], stream: Stream, before: list[str], filters: list[str]
 ) -> Iterator[np.ndarray]:
-    """Yield the frames (H, W, 3) uint8 of these numbers.
-
-    stream: options that choose it. before: filters that need the frames around them.
-    """
+    """Yield the frames (H, W, 3) uint8 of these numbers. before: filters that need the frames around them."""
     chain = ",".join([*before, f"select={_any(numbers)}", _SQUARE, *filters])
-    options = [*stream, "-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
+    options = [*stream.options, "-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
     reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options)
     width, height = next(reader)["size"]
     for data in reader:
