@@ -18,6 +18,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ from splatting.sfm import stages
 from splatting.sfm.adding import added_line, forget_base, keep_base
 from splatting.sfm.cameras import MODES
 from splatting.sfm.capture_page import capture_stage
-from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, Program, Pycolmap, Settings, is_native
+from splatting.sfm.colmap import ADDING, GIVEN, LENS_MODELS, PANORAMA, Program, Pycolmap, Settings, is_native
+from splatting.sfm.images import find_panoramas
 from splatting.sfm.inputs import Inputs, sort_inputs, unused_lines
 from splatting.sfm.layout import FEWEST, Layout, find_images, refuse_foreign_results, scene_folder, take_photos_beside
 from splatting.sfm.orienting import said_of
@@ -65,6 +67,8 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     for line in unused_lines(found.unused):
         print(line)
     names = found.photos
+    if not (args.camera or args.poses or args.add or args.skip_matching):
+        settings = _for_panoramas(settings, layout, names)
     record.note("files", {name: state_of(layout.input / name) for name in names})
     if args.skip_matching:
         planned = []
@@ -90,6 +94,19 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     if kept:
         print(f"reused from an earlier run: {', '.join(kept)}; remove {layout.work} to start from the beginning")
     _conclude(layout, found, args.add)
+
+
+def _for_panoramas(settings: Settings, layout: Layout, names: Sequence[str]) -> Settings:
+    """Take the lens of panoramas if the photos' XMP data name it; else say that photos of such sizes may be some."""
+    wide, marked = find_panoramas(layout.input, names)
+    if len(marked) == len(names):
+        is_native(settings.lenses, [PANORAMA])  # refuses what does not fit together
+        print(f"the photos are panoramas by their XMP data: taking --camera {PANORAMA}")
+        return replace(settings, camera=PANORAMA)
+    if wide:
+        text = f"{len(wide)} of {len(names)} photos are twice as wide as high ({some(wide)})"
+        print(f"{text}: for panoramas of 360 by 180 degrees, give --camera {PANORAMA}, and no other photos")
+    return settings
 
 
 def _conclude(layout: Layout, found: Inputs, adding: bool) -> None:
@@ -123,12 +140,11 @@ def convert_first(source: str) -> None:
         return
     found = find_capture(folder.absolute())
     words, begun = ["--video", *map(str, found.videos)] if found.is_video else [], None
-    odd = found.place != folder.absolute() or os.path.lexists(folder / "input") and not (folder / "input").is_dir()
     if stages_of(folder):
         there = f"; to train what is there, remove {folder / WORK}" if is_scene(folder) else ""
         print(f"a conversion of {folder} was not finished: finishing it first{there}")
         begun = _begun_options(folder)
-    elif is_apart(folder) and (found.photos or found.videos or odd):
+    elif is_apart(folder) and (found.photos or found.videos or os.path.lexists(folder / "input")):
         print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
         if found.is_video and found.photos:
             print(f"taking frames of {some([path.name for path in found.videos])}, which is more than the photos")
@@ -141,7 +157,7 @@ def _begun_options(folder: Path) -> dict[str, Any] | None:
     """Return the options of the conversion that was begun in a folder; None if files that they name are gone."""
     try:
         options = dict(stages_of(folder)["options"]["made_from"])
-        named = [*options.get("video", []), *(options[name] for name in _NAMING if name in options)]
+        named = [*options.get("video", []), *filter(None, map(options.get, _NAMING))]
         complete = all(map(os.path.exists, named))
     except (KeyError, TypeError, ValueError):
         return None
@@ -227,9 +243,8 @@ def main(argv: Sequence[str] | None = None, **options: Any) -> None:
         help="COLMAP program for features, matching and mapping (default: pycolmap does them)")  # fmt: skip
     add("--skip_unreadable", action="store_true", help="leave out photos that cannot be read, and name them")
     add("--magick_executable", default="", metavar="FILE", help="no effect (Pillow resizes the photos)")
-    add(
-        "--resize", action="store_true", help="also write images_2, images_4, images_8, whose sides are divided by that"
-    )
+    add("--resize", action="store_true",
+        help="also write images_2, images_4, images_8, whose sides are divided by that")  # fmt: skip
     add("--orient", action="store_true", help="find where the scene is upright, and its size by GPS, for exports")
     add("--video", nargs="+", action="extend", default=[], metavar="FILE",
         help="take frames of these videos as photos, besides those in input; needs pip install '.[video]'")  # fmt: skip
@@ -247,13 +262,10 @@ def main(argv: Sequence[str] | None = None, **options: Any) -> None:
         "(default: 8192)")  # fmt: skip
     add("--mask_path", default=None, metavar="FOLDER",
         help="masks with the photos' names and .png appended; black areas get no features (default: none)")  # fmt: skip
-    usual = vars(parser.parse_args(["-s", ""]))
-    parser.set_defaults(**{name: value for name, value in options.items() if name in usual})
+    parser.set_defaults(**options)
     args = parser.parse_args(argv)
-    differing = {name: value for name, value in vars(args).items() if value != usual[name] and name != "source_path"}
-    args.options = differing | {name: os.path.abspath(differing[name]) for name in _NAMING if differing.get(name)}
-    if args.video:
-        args.options["video"] = [*map(os.path.abspath, args.video)]
+    named = {name: os.path.abspath(path) for name in _NAMING if (path := getattr(args, name))}
+    args.options = {**vars(args), **named, "video": [*map(os.path.abspath, args.video)]}
     for option, least in (("max_num_features", 100), ("video_frames", FEWEST)):
         if getattr(args, option) < least:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
@@ -261,8 +273,7 @@ def main(argv: Sequence[str] | None = None, **options: Any) -> None:
     try:
         convert(layout, _settings(args), args)
     except json.JSONDecodeError as error:
-        fault = f"a file of the conversion in {layout.scene} is damaged ({error})"
-        raise UserError(f"{fault}; remove {layout.work} to convert from the beginning") from error
+        raise UserError(f"a report in {layout.scene} is damaged; remove {layout.work} to begin anew") from error
 
 
 if __name__ == "__main__":

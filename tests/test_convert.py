@@ -342,7 +342,7 @@ def test_a_verdict_outlives_an_interruption_and_train_finishes_what_was_begun(co
     report = json.loads((copy / "convert_report.json").read_text())
     assert (report["lenses"], report["unusable"]) == ("undistort", None) and not is_unfinished(copy)
     (copy / "convert_report.json").write_text("{")
-    with pytest.raises(UserError, match="is damaged .*; remove .*distorted to convert from the beginning"):
+    with pytest.raises(UserError, match="a report in .* is damaged; remove .*distorted to begin anew"):
         convert.main([*again, "undistort"])
     (copy / "convert_report.json").write_text(json.dumps(report))
     shutil.rmtree(copy / "distorted")

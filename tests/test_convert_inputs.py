@@ -1,6 +1,7 @@
 """Files that convert.py finds in `input`: photos of every format, what is not used, and photos that come later."""
 
 import contextlib
+import re
 import shutil
 import sqlite3
 import sys
@@ -10,13 +11,13 @@ import numpy as np
 import pycolmap
 import pytest
 from photo_room import camera_centers, make_photos
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, PngImagePlugin
 
 import convert
 from scene.images.decode import picture_size
 from splatting.sfm import stages
 from splatting.sfm.adding import keep_base
-from splatting.sfm.images import prepare_images
+from splatting.sfm.images import find_panoramas, prepare_images
 from splatting.sfm.inputs import sort_inputs
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
@@ -158,6 +159,50 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
     with pytest.raises(UserError, match=r"1 photos .*: 6.heic \(HEIC: .*pip install '\.\[heic\]'`, or export as JPEG"):
         sort_inputs(tmp_path)
     assert sort_inputs(tmp_path, skip_unreadable=True).photos == ["1.jpg", "2.jpg", "3.jpg"]
+
+
+@pytest.mark.parametrize("end", ["jpg", "png", "tif", "webp"])
+@pytest.mark.parametrize(
+    ("size", "tags", "found"),
+    [
+        ((64, 32), 'GPano:ProjectionType="equirectangular"', (True, True)),
+        ((64, 32), 'x="1"><GPano:ProjectionType>equirectangular</GPano:ProjectionType', (True, True)),
+        ((64, 32), 'GPano:ProjectionType="cylindrical"', (True, False)),
+        ((64, 31), 'GPano:ProjectionType="equirectangular"', (False, False)),
+        (
+            (64, 32),
+            'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="128" '
+            'GPano:CroppedAreaImageWidthPixels="64"',
+            (True, False),
+        ),
+    ],
+)
+def test_panoramas_are_known_by_xmp(tmp_path, end, size, tags, found):
+    xmp = f"<x:xmpmeta xmlns:GPano='http://ns.google.com/photos/1.0/panorama/'><d {tags}></d></x:xmpmeta>".encode()
+    options: dict = {"xmp": xmp}
+    if end == "png":
+        options = {"pnginfo": PngImagePlugin.PngInfo()}
+        options["pnginfo"].add_itxt("XML:com.adobe.xmp", xmp.decode())
+    if end == "tif":
+        options = {"tiffinfo": {700: xmp}}
+    Image.new("RGB", size).save(tmp_path / f"a.{end}", **options)
+    assert tuple(map(bool, find_panoramas(tmp_path, [f"a.{end}"]))) == found
+
+
+@pytest.mark.parametrize(("marked", "lens", "said"), [
+    (3, "EQUIRECTANGULAR", "panoramas by their XMP data: taking --camera EQUIRECTANGULAR"),
+    (2, "OPENCV", r"3 of 3 photos are twice as wide as high \(0.jpg, .*for panoramas .* --camera EQUIRECT"),
+])  # fmt: skip
+def test_the_lens_of_panoramas_is_taken_or_named(tmp_path, monkeypatch, capsys, marked, lens, said):
+    (tmp_path / "input").mkdir()
+    for number in range(3):
+        xmp = {"xmp": b'GPano:ProjectionType="equirectangular"'} if number < marked else {}
+        Image.new("RGB", (64, 32)).save(tmp_path / "input" / f"{number}.jpg", **xmp)
+    taken: list[str] = []
+    monkeypatch.setattr(convert, "Pycolmap", lambda layout, settings: taken.append(settings.camera) or next(iter(())))
+    with pytest.raises(StopIteration):
+        convert.main(["-s", str(tmp_path)])
+    assert taken == [lens] and re.search(said, capsys.readouterr().out, re.MULTILINE)
 
 
 PLACES = 8

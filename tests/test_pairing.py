@@ -260,7 +260,6 @@ def test_photos_that_change_after_a_conversion_are_named(tmp_path):
     _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", "capture.html", size=1)
     (tmp_path / REPORT).write_text('{"unused": {"live.CR2": "same name"}}')
     record = StageRecord(tmp_path / "distorted" / "stages.json")
-    record.note("options", {"no_gpu": True, "camera": "FOV"})
     record.note("files", {name: state_of(tmp_path / name) for name in ("a.jpg", "b.jpg", "c.jpg")})
     record.run([Stage("capture", 1, lambda: None, lambda: None)])
     _fill(tmp_path, "live.CR2")
@@ -269,8 +268,10 @@ def test_photos_that_change_after_a_conversion_are_named(tmp_path):
     assert changed_photos(tmp_path / "copy") is None
     (tmp_path / "a.jpg").rename(tmp_path / "d.jpg")
     _fill(tmp_path, "b.jpg", size=2)
-    said = r": 1 new \(d.jpg\), 1 gone \(a.jpg\), 1 changed \(b.jpg\); .*convert.py -s .* --camera FOV --no_gpu$"
+    said = r": 1 new \(d.jpg\), 1 gone \(a.jpg\), 1 changed \(b.jpg\); .*run convert.py again, with the"
     assert re.search(said, changed_photos(tmp_path))
+    _fill(tmp_path, "input/e.jpg")
+    assert ": 1 new (e.jpg), 1 gone" in changed_photos(tmp_path)
 
 
 @pytest.mark.parametrize(("name", "mode"), [

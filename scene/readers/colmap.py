@@ -16,6 +16,7 @@ from scene.readers.holdout import EVERY, refuse_rule, split
 from scene.readers.info import CameraInfo, Posed, SceneInfo
 from scene.readers.photos import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
+from scene.readers.scene_folder import REPORT
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
 from splatting.files.unread import say_unread
 from utils.graphics_utils import BasicPointCloud
@@ -59,9 +60,14 @@ def read_colmap(
     names = [photo.name for photo in photos]
     listed_by = f"the COLMAP model in {model_folder}"
     without = (
-        f"run `colmap image_deleter --input_path {model_folder} --output_path {model_folder} --image_names_path LIST`"
+        "list their names in a file, and run `colmap image_deleter "
+        f"--input_path {model_folder} --output_path {model_folder} --image_names_path LIST`"
     )
-    remedy = f"put them there, name their folder with -i, or go on without: list their names in a file, and {without}"
+    if (folder / REPORT).is_file():
+        without = "remove them from input, too, and run convert.py again"
+    others = [path.name for path in sorted(folder.iterdir()) if path.name != images and (path / names[0]).is_file()]
+    there = f" (-i {others[0]} has {names[0]})" if others else ""
+    remedy = f"put them there, name their folder with -i{there}, or go on without: {without}"
     paths = find_images(folder / images, names, listed_by, remedy)
     by_file: dict[str, str] = {}
     for name, path in zip(names, paths, strict=True):

@@ -5,7 +5,6 @@ For convert.py's report, and for those that read it: train.py and doctor.py.
 
 import math
 import os
-import shlex
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -20,7 +19,6 @@ from splatting.findings import Finding, fine, note
 from splatting.findings.photo_files import blurred
 from splatting.findings.points import FEWEST_POINTS
 from splatting.host.listing import some
-from splatting.host.start import typed_command
 from splatting.registry import tools
 from utils.system_utils import UserError
 
@@ -77,31 +75,33 @@ def of_model(
     at_limit: int = 0,
     tried: Sequence[Mapping[str, Any]] = (),
     more_points: int = 0,
+    mode: str = "",
 ) -> Iterator[Finding]:
     """Weaknesses of the chosen model, models[0], that training will show.
 
     at_limit: --max_num_features if a photo reached it, else 0. tried: the models of mapping.py, the chosen one first.
-    more_points: of dense_points.py.
+    more_points: of dense_points.py. mode: --cameras.
     """
     chosen = models[0]
     against = list(tried[0].get("against", ())) if tried else []
     out = sorted(set(images) - set(chosen.registered) - set(against))
     if tried:
-        yield from _of_judgement(tried[0], len(images), partners)
+        yield from _of_judgement(tried[0], len(images), partners, mode)
         if only_turned(tried[0]) or is_folded(tried[0]):
             return  # what else is wrong comes of it
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
         text = f"{len(out)} of {len(images)} photos left out ({some(out)})"
         text += f", {lonely} of them without a match in another photo" if lonely else ""
-        remedy = "take more photos on the way to the others, or remove what is blurred or shows something else"
+        remedy = "take photos on the way to the others, or remove from input what is blurred or shows something else"
         remedy += "; --matcher auto compares more than neighbours" if matcher == "sequential" else ""
         yield Finding(text, remedy)
     others = [len(model.registered) for model in models[1:] if set(model.registered) - set(chosen.registered)]
     if others:
         sizes = f"{len(chosen.registered)} photos are used, the other parts have {', '.join(map(str, others))}"
-        remedy = "take photos that lead from one part to the next, or try --cameras per_photo if they came through "
-        yield Finding(f"the photos form {len(others) + 1} unconnected parts ({sizes})", f"{remedy}several lenses")
+        remedy = "take photos that lead from one part to the next"
+        remedy += _unless(mode, ", or try --cameras per_photo if they came through several lenses")
+        yield Finding(f"the photos form {len(others) + 1} unconnected parts ({sizes})", remedy)
     if (points := chosen.points + more_points) < FEWEST_POINTS:
         remedy = "use larger or more photos" + (f", or --max_num_features {2 * at_limit}" if at_limit else "")
         yield Finding(f"only {points} points; a good start needs {FEWEST_POINTS}", remedy)
@@ -109,12 +109,17 @@ def of_model(
         text = f"a point is in {chosen.track_length:.1f} photos on average, so the photos overlap little"
         yield Finding(text, f"take more photos, {_OVERLAPPING}")
     if _is_large(chosen):
-        remedy = "if objects moved, mask them (--mask_path); if the photos come from several lenses, try --cameras "
-        remedy += "per_photo; for a fisheye lens use --camera OPENCV_FISHEYE"
+        remedy = "if objects moved, mask them (--mask_path); for a fisheye lens use --camera OPENCV_FISHEYE"
+        remedy += _unless(mode, "; if the photos come from several lenses, try --cameras per_photo")
         yield Finding(f"the mean reprojection error is {chosen.error:.1f} pixels", remedy)
 
 
-def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, int]) -> Iterator[Finding]:
+def _unless(mode: str, text: str) -> str:
+    """Return a text that advises --cameras per_photo, "" if that is the mode."""
+    return "" if mode == "per_photo" else text
+
+
+def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, int], mode: str) -> Iterator[Finding]:
     """Findings of the matches about the chosen model (mapping.py). partners: matching photos of each photo."""
     if only_turned(found):
         text = "the camera turned in one place, as rotations alone explain the matches, so the depths are not known"
@@ -131,14 +136,14 @@ def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, 
         yield Finding(text, "look at capture.html, or take more photos that overlap")
     if is_wrong(found):
         matches = f"{found['contradicting']:.0%} of the matches that they were made from"
-        remedy = "if the photos came through several lenses, or are zoomed or cropped, use --cameras per_photo; else "
-        remedy += "remove photos of other things, and take more that overlap"
+        remedy = _unless(mode, "if photos are of several lenses, zoomed or cropped, use --cameras per_photo; else ")
+        remedy += "remove photos of other things from input, and take more that overlap"
         yield Finding(f"the poses contradict {matches}, so they are probably wrong", remedy)
     lonely = [name for name in found.get("against", ()) if partners.get(name, 0) <= LONELY]
     if against := sorted(set(found.get("against", ())) - set(lonely)):
         text = f"{len(against)} of {photos} photos left out ({some(against)}), since their matches contradict the"
-        remedy = "if they came through another lens, or are zoomed or cropped, use --cameras per_photo; else remove "
-        yield Finding(f"{text} others", f"{remedy}them, and take more there")
+        remedy = _unless(mode, "if they are of another lens, zoomed or cropped, use --cameras per_photo; else ")
+        yield Finding(f"{text} others", f"{remedy}remove them from input, and take more there")
     if lonely:
         text = f"{len(lonely)} of {photos} photos left out ({some(lonely)}), since too few others match them"
         yield Finding(text, f"take more there, {_OVERLAPPING}")
@@ -310,7 +315,7 @@ def state_of(path: Path) -> list[Any]:
 def stages_of(source: str | os.PathLike) -> dict[str, Any]:
     """Return what the last conversion in a folder wrote of its stages, in stages.json; {}: nothing, or it is damaged.
 
-    Each has `done`, and `made_from`; the notes `options` and `photos` have values of that conversion.
+    Each has `done`, and `made_from`; the notes `options` and `files` have those of that conversion.
     """
     try:
         return {name: dict(entry) for name, entry in read_json(Path(source) / WORK / "stages.json").items()}
@@ -327,11 +332,12 @@ def changed_photos(source: str | os.PathLike) -> str | None:
     """Say which photos of a scene that convert.py made are new, gone or changed since; None: none."""
     stages, found = stages_of(source), find_capture(Path(source))
     try:
-        before, options = dict(stages["files"]["made_from"]), dict(stages["options"]["made_from"])
+        before = dict(stages["files"]["made_from"])
         ignored = set(read_json(Path(source) / REPORT)["unused"])
     except (OSError, LookupError, TypeError, ValueError):
         return None
-    there = {name: state_of(found.place / name) for name in before if (found.place / name).is_file()}
+    paths = {name: path for name in before for path in (Path(source, name), found.place / name) if path.is_file()}
+    there = {name: state_of(path) for name, path in paths.items()}
     if not there or is_unfinished(source):
         return None
     changed = [name for name, state in there.items() if state != before[name]]
@@ -340,13 +346,8 @@ def changed_photos(source: str | os.PathLike) -> str | None:
     now = {path.relative_to(found.place).as_posix() for path in found.photos}
     kinds = {"new": now - set(before) - ignored, "gone": set(before) - set(there), "changed": changed}
     said = [f"{len(names)} {kind} ({some(sorted(names))})" for kind, names in kinds.items() if names]
-    words = ["-s", str(source)]
-    for name, value in options.items():
-        words += [f"--{name}", *([] if value is True else map(str, value if isinstance(value, list) else [value]))]
-    if not said:
-        return None
-    command = f"{typed_command('convert.py')} {shlex.join(words)}"
-    return f"photos have changed since this scene was converted: {', '.join(said)}; to convert them, run {command}"
+    text = f"photos have changed since this scene was converted: {', '.join(said)}; to take this over, run convert.py "
+    return f"{text}again, with the options that it had" if said else None
 
 
 def left_out(source: str | os.PathLike) -> str | None:
@@ -388,9 +389,7 @@ def check_conversion(source: str | os.PathLike) -> Iterator[Finding]:
         yield Finding(f"{path} is damaged", "remove it, or run convert.py again")
         return
     if verdict:
-        yield Finding(
-            f"convert.py says of this scene: {verdict}", "do what its capture.html advises, and convert again"
-        )
+        yield Finding(f"convert.py says of this scene: {verdict}", "do what its page advises, and convert again")
         return
     text = f"{placed} of {photos} photos were placed by convert.py"
     remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import shutil
 import sys
 from collections.abc import Callable, Collection, Sequence
@@ -24,6 +25,9 @@ JPEG_QUALITY = 95
 _ORIENTATION = 0x0112  # EXIF tag; 1 or absent: upright
 _LYING = (5, 6, 7, 8)  # values of the tag that exchange width and height
 _MOST_NAMED = 20
+# Of Google's Photo Sphere XMP: widths that differ are those of a part.
+_PANORAMA = re.compile(rb"ProjectionType\W{1,6}equirectangular", re.IGNORECASE)
+_PANORAMA_WIDTHS = re.compile(rb"(?:FullPano|CroppedAreaImage)WidthPixels\W{1,6}(\d+)")
 _OR_WITHOUT = "or pass --skip_unreadable to convert.py to go on without photos that cannot be read"
 # Formats that COLMAP reads, or in which photos of other formats are written for it: HEIC and AVIF lose little as JPEG.
 _WRITTEN = {"JPEG": "JPEG", "MPO": "JPEG", "PNG": "PNG", "TIFF": "TIFF", "BMP": "BMP", "HEIF": "JPEG", "AVIF": "JPEG"}
@@ -80,6 +84,20 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
     _in_threads(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
     for found in damaged(equal):
         print(f"warning: {found}", file=sys.stderr)
+
+
+def find_panoramas(folder: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Find the photos that are twice as wide as high, and those of them that are whole panoramas by their XMP data."""
+    wide, marked = [], []
+    for name in names:
+        with contextlib.suppress(*UNREADABLE), open_image(folder / name) as image:
+            if image.width == 2 * image.height:
+                wide.append(name)
+                text = image.info.get("xmp", image.info.get("XML:com.adobe.xmp", b""))
+                text = text.encode() if isinstance(text, str) else text
+                if _PANORAMA.search(text) and len({*_PANORAMA_WIDTHS.findall(text)}) < 2:
+                    marked.append(name)
+    return wide, marked
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:

@@ -264,7 +264,7 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
         if not given:
-            found += of_model(models, names, matches, settings.matcher, at_limit, tried, more)
+            found += of_model(models, names, matches, settings.matcher, at_limit, tried, more, settings.cameras)
             found += of_shared_cameras(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
         later = [path for name, paths in _written_by(layout).items() if record.begun(name) for path in paths]
         whole = layout.undistorted / "whole"
