@@ -54,7 +54,9 @@ def make_colmap_scene(
 
 def _discs(reconstruction, image) -> np.ndarray:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    picture = np.stack([60 + columns, 100 + rows, 120 + 0 * rows], axis=-1).astype(np.uint8)
+    # A background that all photos had would be no part of the scene.
+    blue = 120 + (13 if image.image_id % 2 else -13) + 0 * rows
+    picture = np.stack([60 + columns, 100 + rows, blue], axis=-1).astype(np.uint8)
     from_world = image.cam_from_world()
     points = sorted(reconstruction.points3D.values(), key=lambda point: -(from_world * point.xyz)[2])
     for point in points:

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 import train
 from splatting.findings import Finding
 from splatting.findings.capture import left_out, lines_of, neighbours_of, of_model, unusable, worth
+from splatting.findings.photos import SHARED_TEXT
 from splatting.findings.scene import OUT, with_way
 from splatting.sfm import report
 from splatting.sfm.capture import compared, looks_of
@@ -51,6 +52,8 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     looks = looks_of(folder, NAMES)
     assert looks["a.jpg"].brightness - looks["d.jpg"].brightness == pytest.approx(2.0, abs=0.1)
     assert neighbours_of(_survey()["photos"])["d.jpg"] == []
+    captioned = _report(4, 5, "e.jpg") | {"advice": [f"9% of each photo, at the top, {SHARED_TEXT}; mask it"]}
+    assert not any("e.jpg" in line for line in worth(captioned, _survey()["photos"], looks)["again"])
     found = worth(_report(4, 5, "e.jpg"), _survey()["photos"], looks)
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)

@@ -1,7 +1,8 @@
 """What is wrong with a scene, a training, a model or an installation, and what to do: the rules, by their subject.
 
 environment          packages, GPU, extensions (imports nothing heavy)
-photos, photo_files  what photos show; photos that are there twice, or are damaged
+photos, photo_files  what photos show; photos that are there twice, or blurred
+shared_pixels        parts of nearly all photos that are the same, such as a caption
 cameras, points      where they stand, and what no camera or cloud has
 fit                  whether cameras, points and photos fit together
 scene                all of these in their order, for doctor.py and before a training

@@ -17,6 +17,7 @@ from scene.readers.scene_folder import REPORT, WORK, find_capture
 from splatting.files.json_files import read_json
 from splatting.findings import Finding, fine, note
 from splatting.findings.photo_files import blurred
+from splatting.findings.photos import SHARED_TEXT
 from splatting.findings.points import FEWEST_POINTS
 from splatting.host.listing import some
 from splatting.registry import tools
@@ -242,11 +243,15 @@ def worth(
     soft = blurred({name: look.sharpness for name, look in looks.items()})
     bright = [look.brightness for name, look in looks.items() if name in photos and math.isfinite(look.brightness)]
     spread = round(float(np.std(bright)), 3) if bright else None
+    if any(SHARED_TEXT in line for line in report.get("advice", ())):  # why photos are left out or weakly connected
+        again = _again([], [], soft, spread)
+    else:
+        again = _again(sorted(set(report["left_out"]) - against), weak, soft, spread)
     return {
         "weakly_connected": weak,
         "blurred": soft,
         "brightness_spread_stops": spread,
-        "again": _again(sorted(set(report["left_out"]) - against), weak, soft, spread),
+        "again": again,
     }
 
 

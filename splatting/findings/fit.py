@@ -14,9 +14,8 @@ import numpy as np
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.readers.tracks import Track, projected, rays_to, read_tracks
 from scene.reprojection import BOUND, nearest_pose, pull
-from splatting.files.color_profiles import in_srgb
-from splatting.files.image_files import open_image
 from splatting.findings import Finding, fine, from_error
+from splatting.findings.photo_files import small
 from splatting.host.listing import some
 from splatting.registry import tools
 from utils.graphics_utils import BasicPointCloud, world_to_camera
@@ -174,7 +173,7 @@ def check_colors(info: SceneInfo, tracks: Sequence[Track | None] = ()) -> Iterat
         return
     step = -(-len(info.train_cameras) // _PHOTOS)
     cameras = info.train_cameras[::step]
-    photos = _Photos(cameras, [_pixels(camera) for camera in cameras], cloud)
+    photos = _Photos(cameras, [small(camera.image_path, _SMALL) / 255 for camera in cameras], cloud)
     if wrong := [*_geometric(photos)]:
         yield wrong[0]
     elif (fit := _fitting(photos)) is None:
@@ -223,15 +222,6 @@ def _apart(info: SceneInfo, seen: Sequence[np.ndarray], text: str) -> tuple[str,
         return f"cameras and points do not fit together: {text}", remedy
     remedy = "restore the photos that the cameras were computed from, under their names, or name their folder by -i"
     return f"cameras and photos do not fit together: {text}", remedy
-
-
-def _pixels(camera: CameraInfo) -> np.ndarray:
-    """A photo, small, (H, W, 3) in [0, 1]."""
-    with open_image(camera.image_path) as image:
-        image.draft("RGB", (_SMALL, _SMALL))
-        image = in_srgb(image).convert("RGB")
-        image.thumbnail((_SMALL, _SMALL))
-        return np.asarray(image) / 255
 
 
 def _errors(camera: CameraInfo, photos: Sequence[np.ndarray], cloud: BasicPointCloud) -> np.ndarray:

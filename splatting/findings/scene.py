@@ -5,7 +5,7 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -17,8 +17,8 @@ from splatting.findings import Finding, Severity, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
 from splatting.findings.capture import changed_photos, check_conversion, left_out
 from splatting.findings.fit import check_agreement, check_geometry
-from splatting.findings.photo_files import of_blur, of_damage, of_duplicates
-from splatting.findings.photos import check_views, hints, of_photos
+from splatting.findings.photo_files import of_blur, of_duplicates
+from splatting.findings.photos import SHARED_TEXT, check_photos, check_views, hints
 from splatting.findings.points import check_cloud, of_points
 from utils.system_utils import UserError
 
@@ -39,8 +39,8 @@ def findings(
     alpha = getattr(options, "mask_meaning", "") != "none"
     train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
-    of_files = *of_photos(info, most, alpha), *of_damage(info, most), *of_duplicates(info, halves)
-    found = [*of_cameras(info), *of_files, *of_points(info)]
+    photos = [*check_photos(train, most, alpha), *of_duplicates(info, halves)]
+    found = [*of_cameras(info), *photos, *([] if has_shared_pixels(photos) else of_points(info))]
     return sorted(found, key=lambda one: -one.severity)
 
 
@@ -48,6 +48,11 @@ def with_way(found: Iterable[Finding], source: str | os.PathLike) -> list[Findin
     """Say how photos are taken out of a scene that convert.py made."""
     made, way = (Path(source) / REPORT).is_file(), "remove them from input and run convert.py again"
     return [one._replace(remedy=one.remedy.replace(OUT, way)) if made else one for one in found]
+
+
+def has_shared_pixels(found: Sequence[Finding]) -> bool:
+    """Whether findings name pixels that all photos share: poses, points and colours may be wrong for that reason."""
+    return any(SHARED_TEXT in one.text for one in found)
 
 
 def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:
@@ -98,8 +103,9 @@ def check_dataset(source: str, images: str) -> list[Finding]:
         return [*_notes(said.getvalue()), *with_way([from_error(error)], source)]
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
-    checks += [findings(info, most=MOST_PHOTOS), of_blur(info, MOST_PHOTOS)]
-    if not any(of_lenses(info)):  # else poses and colours have that cause
+    found = findings(info, most=MOST_PHOTOS)
+    checks += [found, of_blur(info, MOST_PHOTOS)]
+    if not any(of_lenses(info)) and not has_shared_pixels(found):  # else poses and colours have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_notes(said.getvalue()), *with_way(chain(*checks, check_conversion(source)), source)]
 

@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from PIL import Image, ImageOps
@@ -16,7 +16,8 @@ from scene.images.find import SideFiles
 from scene.images.masks import Mask, mask_names
 from splatting.files.color_profiles import has_other_colors, in_srgb
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
-from splatting.findings.photo_files import damaged, equal_share
+from splatting.findings import Finding
+from splatting.findings.photos import Photo, check_shared, looks_at
 from splatting.host.machine import threads
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
@@ -28,6 +29,7 @@ _MOST_NAMED = 20
 # Of Google's Photo Sphere XMP: widths that differ are those of a part.
 _PANORAMA = re.compile(rb"ProjectionType\W{1,6}equirectangular", re.IGNORECASE)
 _PANORAMA_WIDTHS = re.compile(rb"(?:FullPano|CroppedAreaImage)WidthPixels\W{1,6}(\d+)")
+_COMPARED = 48  # photos, by their pixels
 _OR_WITHOUT = "or pass --skip_unreadable to convert.py to go on without photos that cannot be read"
 # Formats that COLMAP reads, or in which photos of other formats are written for it: HEIC and AVIF lose little as JPEG.
 _WRITTEN = {"JPEG": "JPEG", "MPO": "JPEG", "PNG": "PNG", "TIFF": "TIFF", "BMP": "BMP", "HEIF": "JPEG", "AVIF": "JPEG"}
@@ -68,21 +70,19 @@ def prepared_names(layout: Layout, names: Sequence[str]) -> dict[str, str]:
 
 
 def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> None:
-    """Raise a UserError that names every photo and mask that is broken or does not fit, and warn of damaged JPEGs."""
+    """Raise a UserError that names every photo and mask that is broken or does not fit; warn of shared pixels."""
     with_mask = find_masks(names, masks, layout.input) if masks else {}
-    equal: dict[str, float | None] = {}
 
     def check(name: str) -> None:
         try:
-            size = _upright_size(layout.input / name)
+            size = upright_size(layout.input / name)
         except UserError as error:
             raise UserError(f"{error}, {_OR_WITHOUT}") from error
         if name in with_mask:
             _check_mask(with_mask[name], name, size)
-        equal[name], _ = equal_share(layout.input / name)
 
     _in_threads(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
-    for found in damaged(equal):
+    for found in find_shared_pixels(layout.input, names, with_mask):
         print(f"warning: {found}", file=sys.stderr)
 
 
@@ -98,6 +98,12 @@ def find_panoramas(folder: Path, names: Sequence[str]) -> tuple[list[str], list[
                 if _PANORAMA.search(text) and len({*_PANORAMA_WIDTHS.findall(text)}) < 2:
                     marked.append(name)
     return wide, marked
+
+
+def find_shared_pixels(folder: Path, names: Sequence[str], masks: Mapping[str, Path]) -> list[Finding]:
+    """Findings of pixels that nearly all photos in a folder share. masks: of some photos, by name."""
+    photos = [Photo(name, folder / name, Mask(masks[name]) if name in masks else None) for name in names]
+    return [*check_shared(looks_at(photos, _COMPARED))]
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:
@@ -171,7 +177,7 @@ def _written(image: Image.Image) -> str:
     return "PNG" if written == "JPEG" and image.has_transparency_data else written
 
 
-def _upright_size(photo: Path) -> tuple[int, int]:
+def upright_size(photo: Path) -> tuple[int, int]:
     width, height = picture_size(photo, colors=True)  # UserError for a truncated file or one of another kind
     try:
         with open_image(photo) as image:

@@ -263,7 +263,11 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         shared = {name: photo["shared"] for name, photo in read_json(layout.capture)["photos"].items()}
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
-        if not given:
+        masks = {name: path for name in names if (path := layout.masks / f"{name}.png").is_file()}
+        shared_pixels = images.find_shared_pixels(root, names, masks)
+        if shared_pixels:  # which other weaknesses come from
+            found += shared_pixels
+        elif not given:
             found += of_model(models, names, matches, settings.matcher, at_limit, tried, more, settings.cameras)
             found += of_shared_cameras(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
         later = [path for name, paths in _written_by(layout).items() if record.begun(name) for path in paths]
