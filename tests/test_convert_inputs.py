@@ -132,8 +132,8 @@ def test_photos_that_can_not_be_read_stop_unless_they_are_left_out(tmp_path, hei
     picture.info["nclx_profile"]["full_range_flag"] = 1
     picture.save(tmp_path / "7.hif", "HEIF", save_nclx_profile=True)
     (tmp_path / "day 2").symlink_to(tmp_path.parent)  # whose photos are not looked for
-    Image.new("1", (50_000, 4_000)).save(tmp_path / "a.png")
-    Image.new("1", (50_000, 4_000)).save(tmp_path / "b.jfif", "PNG")
+    Image.new("1", (50_000, 6_000)).save(tmp_path / "a.png")
+    Image.new("1", (50_000, 6_000)).save(tmp_path / "b.jfif", "PNG")
     Image.new("F", (9, 9)).save(tmp_path / "c.tif")
     with pytest.raises(UserError, match=r"a.png has more than \d+,\d+,\d+ pixels; make it smaller"):  # of a training
         picture_size(tmp_path / "a.png")

@@ -1,6 +1,7 @@
 """Photos to images: sizes, modes, resizing against Pillow, broken files, and colour profiles as formulas have them."""
 
 import io
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pycolmap
 import pytest
 import torch
 from icc import cmyk_profile, grey_profile, rgb_profile, to_srgb
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
 from scene.images.decode import decode, picture_size
 from scene.images.masks import Mask
@@ -209,6 +210,109 @@ def test_alpha_stays_and_masks_are_no_colours(tmp_path):
     half = Image.fromarray(np.where(GREY > 99, 150, 0).astype(np.uint8))
     half.save(tmp_path / "mask.png", icc_profile=grey_profile(0.5))  # which would make 150 white, or darker
     assert np.array_equal(Mask(tmp_path / "mask.png").decode((64, 48))[0].numpy() == 255, GREY > 99)
+
+
+def _exif(space: int, index: str, orientation: int = 1) -> Image.Exif:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update({0xA001: space, 0xA005: {1: index}})
+    return exif
+
+
+def _png(*chunks: tuple[bytes, bytes]) -> PngImagePlugin.PngInfo:
+    info = PngImagePlugin.PngInfo()
+    for name, data in chunks:
+        info.add(name, data)
+    return info
+
+
+def _chromaticities(*places: float) -> tuple[bytes, bytes]:
+    return b"cHRM", struct.pack(">8I", *(round(1e5 * place) for place in places))
+
+
+P3 = 0.3127, 0.3290, 0.680, 0.320, 0.265, 0.690, 0.150, 0.060
+ADOBE = 0.3127, 0.3290, 0.64, 0.33, 0.21, 0.71, 0.15, 0.06
+SRGB = 0.3127, 0.3290, 0.64, 0.33, 0.30, 0.60, 0.15, 0.06
+
+
+@pytest.mark.parametrize(
+    ("suffix", "options", "name"),
+    [
+        ("webp", {"exif": _exif(65535, "R03"), "lossless": True}, "Adobe RGB"),
+        ("png", {"exif": _exif(2, "")}, "Adobe RGB"),
+        ("png", {"exif": _exif(1, "R98")}, "sRGB"),
+        ("png", {"exif": _exif(65535, "R98")}, "sRGB"),
+        ("png", {"exif": _exif(65535, "R03"), "icc_profile": rgb_profile("ProPhoto")}, "ProPhoto"),
+        ("png", {"pnginfo": _png((b"cICP", bytes([12, 13, 0, 1])))}, "Display P3"),
+        ("png", {"pnginfo": _png((b"cICP", bytes([1, 13, 0, 1])), _chromaticities(*P3))}, "sRGB"),
+        ("png", {"pnginfo": _png(_chromaticities(*P3))}, "Display P3"),
+        ("png", {"pnginfo": _png((b"gAMA", struct.pack(">I", 45470)), _chromaticities(*ADOBE))}, "Adobe RGB"),
+        ("png", {"pnginfo": _png((b"gAMA", struct.pack(">I", 45455)))}, "sRGB"),
+        ("png", {"pnginfo": _png((b"gAMA", struct.pack(">I", 45455)), _chromaticities(*SRGB))}, "sRGB"),
+        ("png", {"pnginfo": _png((b"sRGB", b"\0"), (b"gAMA", struct.pack(">I", 100000)))}, "sRGB"),
+        ("png", {"pnginfo": _png((b"gAMA", struct.pack(">I", 0)), _chromaticities(*[0.0] * 8))}, "sRGB"),
+    ],
+)
+def test_colours_that_other_data_tell_are_followed(tmp_path, suffix, options, name):
+    path = tmp_path / f"a.{suffix}"
+    Image.fromarray(COLORS).save(path, **options)
+    found = decode(path, (64, 48)).permute(1, 2, 0).numpy()
+    if name == "sRGB":
+        assert np.array_equal(found, COLORS)
+    assert np.abs(found - 255 * to_srgb(COLORS / 255, name)).max() < 1.5
+
+
+@pytest.mark.parametrize("kind", ["HEIF", "AVIF"])
+def test_code_points_of_heic_and_avif_are_followed(tmp_path, capsys, kind):
+    """Of a P3 picture its colours; of one in PQ a line, as it cannot be shown in sRGB."""
+    pillow_heif = pytest.importorskip("pillow_heif")
+    pillow_heif.register_heif_opener()
+    smooth = np.stack([*np.meshgrid(np.arange(60, 252, 3), np.arange(60, 204, 3)), np.full((48, 64), 90)], -1)
+    image = Image.fromarray(smooth.astype(np.uint8))
+    for primaries, curve in ((12, 13), (9, 16)):
+        path = tmp_path / f"{curve}.{kind.lower()}"
+        nclx = {"color_primaries": primaries, "transfer_characteristics": curve, "matrix_coefficients": 1}
+        image.info["nclx_profile"] = nclx | {"full_range_flag": 1}
+        if kind == "HEIF":
+            image.save(path, kind, save_nclx_profile=True, quality=100, chroma=444)
+        else:
+            image.save(path, kind, quality=100, subsampling="4:4:4")
+            data = path.read_bytes()
+            place = data.index(b"colrnclx") + 8
+            path.write_bytes(data[:place] + struct.pack(">2H", primaries, curve) + data[place + 4 :])
+        found = decode(path, (64, 48)).permute(1, 2, 0).numpy()
+        expected = to_srgb(smooth / 255, "Display P3" if curve == 13 else "sRGB")
+        assert np.abs(found - 255 * expected).mean() < 2
+    said = capsys.readouterr().err
+    assert "colour profile Display P3 are converted to sRGB" in said
+    assert (
+        "warning: photos are taken as sRGB, though their colours are of primaries BT.2020 and transfer curve PQ" in said
+    )
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+def test_photos_for_colmap_are_converted_once(tmp_path, orientation):
+    layout = Layout(tmp_path)
+    layout.input.mkdir()
+    Image.fromarray(COLORS).save(layout.input / "a.png", exif=_exif(65535, "R03"))
+    smooth = Image.fromarray(COLORS[:6, :8] // 3 + 80).resize((64, 48), Image.Resampling.BICUBIC)
+    smooth.save(layout.input / "b.jpg", quality=95, subsampling=0, exif=_exif(65535, "R03", orientation))
+    prepare_images(layout, ["a.png", "b.jpg"], None)
+    upright = np.asarray(smooth) if orientation == 1 else np.rot90(np.asarray(smooth), -1)
+    for name, pixels in (("a.png", COLORS), ("b.jpg", upright)):
+        with Image.open(layout.prepared / name) as image:
+            image.info.pop("icc_profile")  # which not every program keeps
+            image.save(tmp_path / f"again.{name[-3:]}", exif=image.getexif(), quality=100, subsampling=0)
+        found = decode(tmp_path / f"again.{name[-3:]}", pixels.shape[1::-1]).permute(1, 2, 0).numpy()
+        assert np.abs(found - 255 * to_srgb(pixels / 255, "Adobe RGB")).mean() < 2, name
+
+
+def test_there_is_one_limit_of_pixels(tmp_path):
+    Image.new("1", (20_000, 10_000)).save(tmp_path / "a.png")
+    assert picture_size(tmp_path / "a.png") == (20_000, 10_000)
+    Image.new("1", (20_000, 14_000)).save(tmp_path / "b.png")
+    with pytest.raises(UserError, match="b.png has more than 268,435,456 pixels; make it smaller"):
+        picture_size(tmp_path / "b.png")
 
 
 @pytest.mark.parametrize("orientation", [1, 6])

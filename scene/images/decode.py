@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from splatting.files.color_profiles import has_other_colors, in_srgb
-from splatting.files.image_files import UNREADABLE, eight_bits, open_image, sixteen_bits
+from splatting.files.image_files import MOST_PIXELS, UNREADABLE, eight_bits, open_image, sixteen_bits
 from splatting.files.plain_files import not_the_file
 from splatting.host.listing import some
 from utils.system_utils import UserError
@@ -114,7 +114,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
     if other := not_the_file(path):
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
     if isinstance(error, Image.DecompressionBombError):
-        return UserError(f"{path} has more than {2 * Image.MAX_IMAGE_PIXELS:,} pixels; make it smaller")
+        return UserError(f"{path} has more than {MOST_PIXELS:,} pixels; make it smaller")
     return UserError(
         f"cannot read {path} ({str(error) or type(error).__name__}); replace it or take it out of the scene"
     )

@@ -32,6 +32,7 @@ from scene.images.lens import (
 )
 from scene.images.masks import TRANSPARENT, Mask
 from scene.readers.info import CameraInfo, are_exchanged, exchanged_sides
+from splatting.files.color_tags import mark_srgb
 from splatting.files.folders import cache_folder, remove_temporary_files
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.plain_files import plain
@@ -236,6 +237,7 @@ def _without_turn(photo: Path) -> bytes:
         exif = image.getexif()
     del exif[ExifTags.Base.Orientation]
     try:
+        mark_srgb(exif)
         return exif.tobytes()
     except (*UNREADABLE, AttributeError):
         return b""

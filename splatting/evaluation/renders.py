@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from splatting.evaluation.comparison import SCORES
 from splatting.evaluation.model_folder import json_or_none, load_scores
-from splatting.files.image_files import UNREADABLE, open_render
+from splatting.files.image_files import UNREADABLE, open_image
 from splatting.host.listing import as_utf8
 from utils.system_utils import UserError, atomic_write, saved_ply
 
@@ -88,7 +88,7 @@ def image_size(file: Path) -> tuple[int, int]:
 
 def _opened(file: Path, read: Callable[[Image.Image], Any]) -> Any:
     try:
-        with open_render(file) as image:
+        with open_image(file) as image:
             return read(image)
     except UNREADABLE as error:
         raise UserError(f"{file} is missing or damaged ({error}); run render.py again") from error

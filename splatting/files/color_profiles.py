@@ -1,4 +1,4 @@
-"""Colours of photos by their ICC profiles: those of other spaces become sRGB, in which all else here is."""
+"""Colours of photos by their ICC profiles, also those of color_tags.py: other spaces become sRGB, as all else here."""
 
 import functools
 import io
@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image, ImageCms
 from tqdm import tqdm
 
+from splatting.files.color_tags import UNKNOWN
 from splatting.files.image_files import eight_bits, sixteen_bits
 
 _NEAR = 2  # of 255, that profiles of sRGB by several makers differ
@@ -44,10 +45,13 @@ def in_srgb(image: Image.Image) -> Image.Image:
 
 
 def _change_of(image: Image.Image) -> _Change:
-    profile = image.info.get("icc_profile")
-    if not profile:
+    mode = "I;16" if image.mode.startswith("I") else {"LA": "L", "1": "L"}.get(image.mode, image.mode)
+    if profile := image.info.get("icc_profile"):
+        change = _read(profile, mode)
+    elif unknown := image.info.get(UNKNOWN):
+        change = _Change(None, said=f"warning: photos are taken as sRGB, though their colours are of {unknown}")
+    else:
         return _Change(None)
-    change = _read(profile, "I;16" if image.mode.startswith("I") else {"LA": "L", "1": "L"}.get(image.mode, image.mode))
     if change.said and change.said not in _SAID:
         _SAID.add(change.said)
         name = getattr(image, "filename", "")

@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 import re
 import struct
-import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image, PngImagePlugin
 
+from splatting.files.color_tags import add_profile
 from splatting.files.plain_files import plain
 from splatting.files.writing import atomic_write
 from splatting.host.errors import UserError
@@ -22,7 +22,8 @@ from splatting.host.errors import UserError
 if TYPE_CHECKING:
     import torch
 
-MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's default limit is lower
+MOST_PIXELS = 1 << 28  # 16384 a side, the largest training size; Pillow's own limit is lower
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS // 2  # Pillow warns beyond it, and refuses beyond twice as many
 UNREADABLE = (
     *(OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError),
     *(TypeError, LookupError, ArithmeticError, struct.error),
@@ -51,23 +52,12 @@ _DIM = 0.3  # brightness of what a mask leaves out
 def open_image(path: Path) -> Image.Image:
     """Open an image file of one of FORMATS; its pixels are read later. Raises one of UNREADABLE if that fails.
 
-    HEIF only where a reader of it was added to Pillow.
+    HEIF only where a reader of it was added to Pillow. A photo without an ICC profile gets that of `add_profile`.
     """
-    return Image.open(plain(path), formats=[name for name in FORMATS if name != "HEIF" or name in Image.OPEN])
-
-
-def open_render(path: Path) -> Image.Image:
-    """Open an image file; its pixels are read later. Raises one of UNREADABLE if that fails."""
-    usual = Image.MAX_IMAGE_PIXELS
-    Image.MAX_IMAGE_PIXELS = MOST_PIXELS
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", Image.DecompressionBombWarning)
-            return open_image(path)
-    except Image.DecompressionBombWarning as error:
-        raise Image.DecompressionBombError(str(error)) from error
-    finally:
-        Image.MAX_IMAGE_PIXELS = usual
+    path = plain(path)
+    image = Image.open(path, formats=[name for name in FORMATS if name != "HEIF" or name in Image.OPEN])
+    add_profile(image, path)
+    return image
 
 
 def sixteen_bits(image: Image.Image) -> Image.Image:

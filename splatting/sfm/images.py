@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from PIL import Image, ImageOps
@@ -15,6 +15,7 @@ from scene.images.decode import picture_size
 from scene.images.find import SideFiles
 from scene.images.masks import Mask, mask_names
 from splatting.files.color_profiles import has_other_colors, in_srgb
+from splatting.files.color_tags import mark_srgb
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.findings import Finding
 from splatting.findings.photos import Photo, check_shared, looks_at
@@ -100,9 +101,10 @@ def find_panoramas(folder: Path, names: Sequence[str]) -> tuple[list[str], list[
     return wide, marked
 
 
-def find_shared_pixels(folder: Path, names: Sequence[str], masks: Mapping[str, Path]) -> list[Finding]:
-    """Findings of pixels that nearly all photos in a folder share. masks: of some photos, by name."""
-    photos = [Photo(name, folder / name, Mask(masks[name]) if name in masks else None) for name in names]
+def find_shared_pixels(folder: Path, names: Sequence[str], masks: Path) -> list[Finding]:
+    """Find pixels that nearly all photos in a folder share. masks: folder of those that some photos have."""
+    given = {name: Mask(path) for name in names if (path := masks / f"{name}.png").is_file()}
+    photos = [Photo(name, folder / name, given.get(name)) for name in names]
     return [*check_shared(looks_at(photos, _COMPARED))]
 
 
@@ -155,7 +157,9 @@ def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
                 link(source, target)
                 return target
             upright = ImageOps.exif_transpose(image)
-            _save(upright, target, image, exif=upright.getexif())
+            exif = upright.getexif()
+            mark_srgb(exif)
+            _save(upright, target, image, exif=exif)
             return target
     except UNREADABLE as error:
         raise UserError(f"cannot rewrite the photo {source} for COLMAP ({error}); replace or remove it") from error

@@ -11,19 +11,18 @@ from typing import NamedTuple
 from PIL import Image
 
 from scene.images.decode import picture_size
+from splatting.files.color_tags import HDR, code_points
 from splatting.files.image_files import HEIF_SUFFIXES, RAW_SUFFIXES, SUFFIXES, UNREADABLE, VIDEO_SUFFIXES, open_image
 from splatting.files.plain_files import not_the_file, plain
 from splatting.host.listing import some
 from utils.system_utils import UserError
 
-_HEAD = 1 << 16  # bytes that hold the colours of a HEIC or AVIF file
 # Brands of ISO files.
 _HEIF = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"avif", b"avis")
 _DNG_VERSION = 50706  # TIFF tag: a RAW file, whose first picture is a thumbnail
 _VIDEO_STARTS = (b"\x1a\x45\xdf\xa3", b"\x00\x00\x01\xba")  # Matroska and WebM; MPEG program streams
 # Formats whose files often lie beside a JPEG of the same shot.
 _OFTEN_DOUBLE = ("HEIF", "AVIF", "RAW")
-_TRANSFER_HDR = (16, 18)  # PQ and HLG, of ITU-T H.273
 _INSTALL = "HEIC: `pip install '.[heic]'`, or export as JPEG"
 _DEVELOP = "RAW: export as JPEG or TIFF"
 _HDR = "HDR picture: export as SDR"
@@ -95,23 +94,21 @@ def _kind(path: Path, thorough: bool) -> _Kind:
         with open(plain(path), "rb") as file:
             head = file.read(16)
             brand = head[8:12] if head[4:8] == b"ftyp" else b""
-            head += file.read(_HEAD) if brand in _HEIF else b""
     except OSError as error:
         return _Kind("unknown", f"{error.strerror}: make it readable")
     if suffix in RAW_SUFFIXES or brand == b"crx ":
         return _Kind("RAW", _DEVELOP)
     if brand in _HEIF:
-        return _heif_kind(path, head, thorough)
+        return _heif_kind(path, thorough)
     video = brand or head.startswith(_VIDEO_STARTS) or (head[:4], head[8:12]) == (b"RIFF", b"AVI ")
     if video or suffix in VIDEO_SUFFIXES:
         return _Kind("", "video: pass it as --video to take frames of it")
     return _picture_kind(path, thorough)
 
 
-def _heif_kind(path: Path, head: bytes, thorough: bool) -> _Kind:
+def _heif_kind(path: Path, thorough: bool) -> _Kind:
     """Of HEIC and AVIF, which are files of one container."""
-    colour = head.find(b"colrnclx")  # then the numbers of primaries and transfer, two bytes each
-    if colour >= 0 and int.from_bytes(head[colour + 10 : colour + 12], "big") in _TRANSFER_HDR:
+    if (points := code_points(plain(path), "HEIF")) and points[1] in HDR:
         return _Kind("HEIF", _HDR)
     if not _is_whole(path):
         return _Kind("HEIF", _DAMAGED)

@@ -263,10 +263,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         shared = {name: photo["shared"] for name, photo in read_json(layout.capture)["photos"].items()}
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
-        masks = {name: path for name in names if (path := layout.masks / f"{name}.png").is_file()}
-        shared_pixels = images.find_shared_pixels(root, names, masks)
-        if shared_pixels:  # which other weaknesses come from
-            found += shared_pixels
+        if same := images.find_shared_pixels(root, names, layout.masks):  # which other weaknesses come from
+            found += same
         elif not given:
             found += of_model(models, names, matches, settings.matcher, at_limit, tried, more, settings.cameras)
             found += of_shared_cameras(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
@@ -274,10 +272,9 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         whole = layout.undistorted / "whole"
         mkdir_p(whole)
         (layout.undistorted / "sparse").rename(whole / "0")
-        kept = "native" if native else "undistort"
         described = cameras.described(chosen.cameras, lenses)
-        made_of = {**made, "advice": [*map(str, found)], "cameras": described, "lenses": kept}
-        made_of |= {"more_points": more, "tried": tried}
+        made_of = {**made, "advice": [*map(str, found)], "cameras": described}
+        made_of |= {"lenses": "native" if native else "undistort", "more_points": more, "tried": tried}
         # `sparse` goes first and comes last: what has one has the photos, too, and the report with its verdict.
         _remove(layout.sparse, layout.images, layout.report, *later)
         written.rename(layout.images)
