@@ -5,7 +5,7 @@ import os
 import re
 import shutil
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from PIL import Image, ImageOps
@@ -101,9 +101,9 @@ def find_panoramas(folder: Path, names: Sequence[str]) -> tuple[list[str], list[
     return wide, marked
 
 
-def find_shared_pixels(folder: Path, names: Sequence[str], masks: Path) -> list[Finding]:
-    """Find pixels that nearly all photos in a folder share. masks: folder of those that some photos have."""
-    given = {name: Mask(path) for name in names if (path := masks / f"{name}.png").is_file()}
+def find_shared_pixels(folder: Path, names: Sequence[str], masks: Mapping[str, Path]) -> list[Finding]:
+    """Find pixels that nearly all photos in a folder share. masks: files by a photo's name."""
+    given = {name: Mask(path) for name, path in masks.items() if path.is_file()}
     photos = [Photo(name, folder / name, given.get(name)) for name in names]
     return [*check_shared(looks_at(photos, _COMPARED))]
 

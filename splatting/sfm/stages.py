@@ -241,9 +241,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         names = image_names(root)
         matches = colmap.partners(layout.database)
         refuse_nothing(models, names, matches, settings.matcher)
-        chosen, limit = models[0], settings.max_num_features
+        chosen, lenses, limit = models[0], cameras.lenses(root, names), settings.max_num_features
         at_limit = limit if colmap.most_features(layout.database) >= limit else 0
-        lenses = cameras.lenses(root, names)
         given = settings.mapper == colmap.GIVEN
         found = [*of_given_poses(chosen, names)] if given else []  # UserError before anything is replaced
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
@@ -251,9 +250,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
         command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
         written = layout.undistorted / "images"
-        total = len(chosen.registered)
-        title = "Copying photos" if native else "Undistorting"
-        run_programs(layout.log, [command], title, total, lambda: sum(p.is_file() for p in written.rglob("*")))
+        count, title = len(chosen.registered), "Copying photos" if native else "Undistorting"
+        run_programs(layout.log, [command], title, count, lambda: sum(p.is_file() for p in written.rglob("*")))
         missing = [name for name in chosen.registered if not (written / name).is_file()]
         if missing:
             raise UserError(
@@ -263,7 +261,8 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         shared = {name: photo["shared"] for name, photo in read_json(layout.capture)["photos"].items()}
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
-        if same := images.find_shared_pixels(root, names, layout.masks):  # which other weaknesses come from
+        masks = {name: layout.masks / f"{name}.png" for name in names}
+        if same := images.find_shared_pixels(root, names, masks):  # which other weaknesses come from
             found += same
         elif not given:
             found += of_model(models, names, matches, settings.matcher, at_limit, tried, more, settings.cameras)
