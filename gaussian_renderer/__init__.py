@@ -223,6 +223,14 @@ def wake(sleeping: Sleeping, camera: Camera, pc: GaussianModel, pipe: argparse.N
     sleeping.wake(scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background), raw))
 
 
+@torch.no_grad()
+def shown_by(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """Gaussians of this process that reach a tile of a view: (N,) bool."""
+    gaussians, raw = model_inputs(camera, pc, pipe)
+    settings = rasterizer_settings(camera, pc, pipe, pc.get_xyz.new_zeros(3))
+    return OPERATORS.project(*scene_arguments(gaussians, settings, raw))[3] > 0
+
+
 def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
     """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
     return draw(camera, pc, pipe, pc.get_xyz.detach().new_zeros(3), by_bands=True).decisive()

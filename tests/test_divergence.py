@@ -193,3 +193,10 @@ def test_rates_a_hundred_times_too_high_end_in_a_warning(colmap_scene, tmp_path,
     _train(colmap_scene, tmp_path / "usual", *options, iterations=150)
     assert "the model is worse" not in capfd.readouterr().err
     assert json.loads((tmp_path / "high" / "train_log.json").read_text())[-1]["loss"] > 0
+
+
+def test_a_start_that_no_view_shows(blender_scene, tmp_path):
+    (tmp_path / "far.txt").write_text("\n".join(f"{n} {n * n} {1e4 - n}" for n in range(50)))
+    with pytest.raises(UserError, match="none of the 6 training views shows any Gaussian of the start; check the sc"):
+        _train(blender_scene, tmp_path / "out", "--init_pcd_path", tmp_path / "far.txt", iterations=5)
+    assert not (tmp_path / "out").exists()

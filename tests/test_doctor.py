@@ -14,7 +14,7 @@ import simple_knn
 import torch
 from gaussians import pipeline
 from PIL import Image
-from synthetic import HEIGHT, WIDTH
+from synthetic import HEIGHT, WIDTH, edit_json
 
 import doctor
 import splatting.findings.model
@@ -125,6 +125,26 @@ def test_cameras_that_stand_or_look_oddly(info):
     assert "all cameras stand in one place" in line
 
 
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda pose: pose, ""),
+        (np.linalg.inv, "all cameras stand in one place, so depth cannot be found; check the scale, and whether poses"),
+        (
+            lambda pose: pose * [1, -1, -1, 1],
+            "the cameras stand around a place and look away from it; check the scale,",
+        ),
+    ],
+)
+def test_poses_of_another_form_without_points(blender_scene, change, text):
+    for file in blender_scene.glob("transforms_*.json"):
+        edit_json(file, lambda content: [f.update(transform_matrix=change(np.array(f["transform_matrix"])).tolist())
+                                         for f in content["frames"]])  # fmt: skip
+    found = read_scene(blender_scene, "images", hold_out=False)
+    said = [*_said(of_cameras(found)), *problems(check_extent(found))]
+    assert [line[: len(text)] for line in said] == [text] * bool(text)
+
+
 def _said(found) -> list[str]:
     return [str(one) for one in found]
 
@@ -139,7 +159,13 @@ def test_points_and_cameras_that_do_not_meet(info):
     half_turn = np.diag([-1.0, 1.0, -1.0])
     turned = lambda camera: {"R": camera.R @ half_turn, "T": half_turn @ camera.T}  # noqa: E731
     away = _with_cloud(_with_cameras(info, lambda _, camera: turned(camera)), many)
-    assert "100% of the points are in no photo; poses and points do not belong" in _said(of_points(away))[0]
+    assert (
+        "100% of the points are in no photo: poses and points do not belong together; check the scale, and "
+        in (_said(of_points(away))[0])
+    )
+    assert _said(of_points(dataclasses.replace(away, has_random_points=True))) == []
+    few = _with_cloud(_with_cameras(info, lambda i, camera: turned(camera) if i % 4 == 0 else {}), many)
+    assert "5 cameras have hardly any point in view" in (line := _said(of_points(few))[0]) and "remove" not in line
     one = _with_cloud(_with_cameras(info, lambda i, camera: {} if i else turned(camera)), many)
     name = info.train_cameras[0].image_name
     assert f"1 cameras have hardly any point in view ({name})" in _said(of_points(one))[0]

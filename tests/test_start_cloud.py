@@ -1,5 +1,6 @@
 """The cloud that training starts from: files of points of several formats, and random points in the cameras' views."""
 
+import json
 import tracemalloc
 import zipfile
 from dataclasses import replace
@@ -183,6 +184,39 @@ def test_random_points_of_a_blender_scene_are_the_references_cube(blender_scene)
     assert len(read(blender_scene).point_cloud.points) == 2
     info = read(blender_scene, init_type="random")
     assert info.ply_path is None and np.abs(info.point_cloud.points).max() <= np.float32(1.3)
+
+
+@pytest.mark.parametrize("random", [{}, {"init_type": "random"}])
+@pytest.mark.parametrize("scale", [1e-3, 0.5, 1, 1000])
+@pytest.mark.parametrize("move", [(0, 0, 0), (1e6, -3e5, 10)])
+def test_random_points_of_a_blender_scene_in_any_unit(blender_scene, capsys, random, scale, move):
+    plain = read(blender_scene, **random).point_cloud.points
+    _change_poses(blender_scene, lambda pose: pose[:3, 3].__imul__(scale).__iadd__(np.array(move) * max(scale, 1)))
+    info = read(blender_scene, **random)
+    points = (info.point_cloud.points + info.offset - np.array(move) * max(scale, 1)) / scale
+    if scale == 1 and not any(move):
+        np.testing.assert_array_equal(points, plain)
+        return
+    np.testing.assert_allclose(points / np.abs(points).max(), plain / 1.3, atol=0.02)
+    assert "random points are put into a cube" in capsys.readouterr().err
+
+
+def _change_poses(scene: Path, change) -> None:
+    """Change the poses (4, 4) of a Blender scene's cameras in place."""
+    for file in scene.glob("transforms_*.json"):
+        content = json.loads(file.read_text())
+        for frame in content["frames"]:
+            change(pose := np.array(frame["transform_matrix"]))
+            frame["transform_matrix"] = pose.tolist()
+        file.write_text(json.dumps(content))
+
+
+def test_random_points_where_blender_cameras_look_outwards(blender_scene, capsys):
+    _change_poses(blender_scene, lambda pose: pose[:3, 1:3].__imul__(-1))
+    info = read(blender_scene)
+    points = info.point_cloud.points
+    assert info.has_random_points and np.linalg.norm(points, axis=1).max() > 8
+    assert "random points are put into the views; their axes must be those of OpenGL" in capsys.readouterr().err
 
 
 def test_a_cloud_of_no_points(colmap_scene):

@@ -15,7 +15,7 @@ from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.photos import camera_info
 from scene.readers.point_cloud import color_fractions
 from scene.readers.scene_folder import COLMAP
-from scene.readers.start_cloud import StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
+from scene.readers.start_cloud import StartCloud, StartOptions, random_for_blender, random_in_frusta, scene_info
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -66,13 +66,13 @@ def scene_of(dataset: Mapping[str, Any], start: StartOptions) -> SceneInfo:
     def own() -> StartCloud:
         points, colors = dataset["points3D_xyz"], dataset["points3D_rgb"]
         if points is None:
-            return StartCloud(random(), None)
+            return StartCloud(random(), None, is_random=True)
         colors = np.full(points.shape, 0.5) if colors is None else color_fractions(np.asarray(colors), "points3D_rgb")
         return StartCloud(BasicPointCloud(points.astype(np.float32), colors, np.zeros_like(points)), None)
 
     def random() -> BasicPointCloud:
         synthetic = dataset["metadata"].get("background_color") is not None
-        return random_in_cube() if synthetic else random_in_frusta(views)
+        return random_for_blender(views, "the dataset") if synthetic else random_in_frusta(views)
 
     return scene_info((views, []), start, own, random, "the dataset has no points")
 

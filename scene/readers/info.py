@@ -194,7 +194,7 @@ class SceneInfo(_LikeNamedTuple):
 
     nerf_normalization: "radius", the extent E in world units, and "translate" (3,), minus the cameras' centre.
     is_nerf_synthetic: a Blender scene. offset (3,) float64: the world's coordinates of the frame's origin
-    (`world_offset`); zero by default.
+    (`world_offset`); zero by default. has_random_points: nobody has given points, so the reader has made some.
     """
 
     point_cloud: BasicPointCloud | None
@@ -205,6 +205,7 @@ class SceneInfo(_LikeNamedTuple):
     is_nerf_synthetic: bool = False
     _: KW_ONLY
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    has_random_points: bool = False
 
     def _replace(self, **changes: Any) -> "SceneInfo":
         """A copy with some fields changed."""

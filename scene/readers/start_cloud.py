@@ -1,12 +1,13 @@
 """The points that training starts from: the scene's own, a file's, or random ones."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from scene.readers.info import CameraInfo, SceneInfo, normalization, scene_extent
+from scene.readers.info import CameraInfo, SceneInfo, camera_centers, normalization, scene_extent
 from scene.readers.point_cloud import is_ply, read_point_cloud
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -17,6 +18,8 @@ RANDOM_POINTS = 100_000
 RANDOM_HALF_SIZE = 1.3  # the NeRF-synthetic objects lie within this cube
 _NEAREST, _FARTHEST = 0.25, 2.5  # depths of random points, as parts of the distance from cameras to their focus
 _GREY = 127 / 255
+_CUBE = 0.45  # half of the cube as a part of the photo's width, where NeRF-synthetic cameras see it
+_OFF, _LARGER = 0.5, 1.5  # departures from those: half sizes of the cube, and a factor
 # Mean squared sine of the angles between optical axes, about, below which they have no focus: 1.8 degrees.
 _PARALLEL = 1e-3
 
@@ -32,10 +35,11 @@ OWN_POINTS = StartOptions()
 
 
 class StartCloud(NamedTuple):
-    """Points, and the PLY they come from; None for points of another kind of file or of none."""
+    """Points, and the PLY they come from; None for points of another kind of file or of none. is_random: made here."""
 
     cloud: BasicPointCloud | None
     ply_path: Path | None
+    is_random: bool = False
 
 
 def scene_info(
@@ -52,7 +56,8 @@ def scene_info(
     """
     start = StartCloud(None, None) if options is None else _choose(options, own, random, lacking)
     points = None if start.cloud is None else start.cloud.points
-    return SceneInfo(start.cloud, *views, normalization(views[0], points), start.ply_path, is_nerf_synthetic)
+    size = normalization(views[0], points)
+    return SceneInfo(start.cloud, *views, size, start.ply_path, is_nerf_synthetic, has_random_points=start.is_random)
 
 
 def _choose(
@@ -64,7 +69,7 @@ def _choose(
         path = Path(options.points)
         return StartCloud(read_point_cloud(path), path if is_ply(path) else None)
     if options.kind == RANDOM:
-        return StartCloud(random(), None)
+        return StartCloud(random(), None, is_random=True)
     start = own()
     if start is None or not len(start.cloud.points):
         raise UserError(
@@ -73,10 +78,31 @@ def _choose(
     return start
 
 
-def random_in_cube() -> BasicPointCloud:
-    """Grey points spread evenly over a cube around the origin, as in the reference for Blender scenes."""
-    random = np.random.default_rng(0)
-    return _grey(random.uniform(-RANDOM_HALF_SIZE, RANDOM_HALF_SIZE, (RANDOM_POINTS, 3)))
+def random_for_blender(cameras: list[CameraInfo], source: object) -> BasicPointCloud:
+    """Grey points spread evenly over a cube around the origin, as in the reference for Blender scenes.
+
+    Where the cameras look at another place, or at one of another size, they are in a cube there; where they do not
+    stand around one, `random_in_frusta`. A message naming the source says so.
+    """
+    turns, moves = np.array([camera.R for camera in cameras]), np.array([camera.T for camera in cameras])
+    widths = np.array([camera.width / camera.fx for camera in cameras])
+    sizes = RANDOM_HALF_SIZE / np.maximum(moves[:, 2] * widths, 1e-9) / _CUBE
+    aside = np.linalg.norm(moves[:, :2], axis=1) > _OFF * RANDOM_HALF_SIZE
+    if np.median(aside | (sizes < 1 / _LARGER) | (sizes > _LARGER)) == 0:
+        return _in_cube(np.zeros(3), RANDOM_HALF_SIZE)
+    said = f"the cameras of {source} do not look at the cube of {2 * RANDOM_HALF_SIZE:g} units around the origin that"
+    said += " those of Blender scenes look at, so random points are put"
+    focus = nearest_to_axes(camera_centers(cameras), turns[:, :, 2])
+    if focus and focus[1] < scene_extent(cameras):
+        middle, half = focus[0], _CUBE * focus[1] * float(np.median(widths))
+        print(f"{said} into a cube of {2 * half:.3g} around the place that they look at", file=sys.stderr)
+        return _in_cube(middle, half)
+    print(f"{said} into the views; their axes must be those of OpenGL, y up and z backward", file=sys.stderr)
+    return random_in_frusta(cameras)
+
+
+def _in_cube(middle: np.ndarray, half: float) -> BasicPointCloud:
+    return _grey(np.random.default_rng(0).uniform(-half, half, (RANDOM_POINTS, 3)) + middle)
 
 
 def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
@@ -104,7 +130,7 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
 
 def _focus_distance(cameras: list[CameraInfo]) -> float:
     extent = scene_extent(cameras)
-    focus = nearest_to_axes(np.array([c.center for c in cameras]), np.array([c.R[:, 2] for c in cameras]))
+    focus = nearest_to_axes(camera_centers(cameras), np.array([camera.R[:, 2] for camera in cameras]))
     return focus[1] if focus and focus[1] > 0.1 * extent else extent
 
 

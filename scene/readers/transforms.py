@@ -24,12 +24,20 @@ from scene.readers.phone_scans import read_polycam, read_record3d
 from scene.readers.photos import camera_info, finished
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.scene_folder import camera_file
-from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_cube, random_in_frusta, scene_info
+from scene.readers.start_cloud import (
+    OWN_POINTS,
+    StartCloud,
+    StartOptions,
+    random_for_blender,
+    random_in_frusta,
+    scene_info,
+)
 from scene.readers.transforms_lens import FIELDS, circle_of, lens_of
 from splatting.files.image_files import SUFFIXES
 from splatting.files.json_files import read_json
 from splatting.files.unread import say_unread
 from splatting.host.listing import some
+from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
 SPLITS = ("train_filenames", "val_filenames", "test_filenames")
@@ -65,13 +73,16 @@ def read_blender(
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
 
+    def random() -> BasicPointCloud:
+        return random_for_blender(train, files[0])
+
     def own() -> StartCloud:
         ply = _ply_in(folder)
-        return StartCloud(read_point_cloud(ply), ply) if ply else StartCloud(random_in_cube(), None)
+        return StartCloud(read_point_cloud(ply), ply) if ply else StartCloud(random(), None, is_random=True)
 
     _say_if_unused(images, files[0], train)
     lacking = f"{folder / 'points3d.ply'} has no points"
-    return scene_info((train, test), start, own, random_in_cube, lacking, is_nerf_synthetic=True)
+    return scene_info((train, test), start, own, random, lacking, is_nerf_synthetic=True)
 
 
 def read_poses(path: Path) -> list[Posed]:

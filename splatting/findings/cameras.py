@@ -20,10 +20,15 @@ from scene.readers.info import (
     standing_apart,
 )
 from scene.readers.scene_folder import find_capture
+from scene.readers.start_cloud import nearest_to_axes
 from scene.readers.tracks import enlargement
 from splatting.findings import Finding, Severity, fine
 from splatting.host.listing import some
 
+OTHER_FORMS = (
+    "check the scale, and whether poses are as the file needs them: COLMAP's from world to camera, y down and z "
+    "forward, with a translation that is no place; those of transforms.json from camera to world, y up and z backward"
+)
 # Learning rates and size limits are fractions of the extent, but depths below 0.2 are culled and float32 is used.
 EXTENT = (1e-3, 1e4)  # photos of 4.8 score the same within seeds at 0.0048 and 4,800
 OPENING = (10.0, 150.0)  # degrees, of a pinhole; outside, the focal length is doubtful
@@ -35,14 +40,33 @@ _STEP = 1e-3  # of the extent: half a pixel or more in photos that are not small
 _OFF = 0.02  # steps from a rounded number, which arithmetic leaves
 _NEARLY_ALL = 0.99
 _SAMPLE = 5000  # points
+_FEWEST = 4  # cameras whose places tell of the form of their poses
+_ONE_PLACE = 1e-6  # of the distance from the origin, which even map coordinates do not reach
+_MEETING = 0.05  # of the distance to where axes meet, by which they may miss it
 _LONGER = 0.03  # difference of focal lengths that counts
 
 
 def of_cameras(info: SceneInfo) -> Iterator[Finding]:
     """What is wrong with the cameras."""
+    yield from wrong_forms(info)
     yield from of_lenses(info)
     yield from _exchanged([*info.train_cameras, *info.test_cameras])
     yield from _places(info)
+
+
+def wrong_forms(info: SceneInfo) -> Iterator[Finding]:
+    """Poses that, where no points tell more, look like those of another form, as of a matrix that is inverted."""
+    centers = camera_centers(info.train_cameras)
+    if len(centers) < _FEWEST or not (info.has_random_points or info.point_cloud is None):
+        return
+    if np.ptp(centers, axis=0).max() < _ONE_PLACE * np.abs(centers + info.offset).max():
+        yield Finding("all cameras stand in one place, so depth cannot be found", OTHER_FORMS)
+        return
+    axes = np.array([camera.R[:, 2] for camera in info.train_cameras])
+    if behind := nearest_to_axes(centers, -axes):
+        missed = np.linalg.norm(np.cross(behind[0] - centers, axes), axis=1)
+        if np.median(missed) < _MEETING * behind[1]:
+            yield Finding("the cameras stand around a place and look away from it", OTHER_FORMS)
 
 
 def of_lenses(info: SceneInfo) -> Iterator[Finding]:
@@ -61,7 +85,7 @@ def _chart(view: CameraInfo) -> str:
 
 def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
     """Large coordinates, as of maps, that were written with too few digits for the scene's extent."""
-    if not (info.offset.any() and info.extent):
+    if not (info.offset.any() and info.extent) or any(wrong_forms(info)):
         return
     centers = camera_centers(views) + info.offset
     moves = np.array([view.T - view.R.T @ info.offset for view in views])  # as COLMAP's files have them
@@ -155,7 +179,7 @@ def _places(info: SceneInfo) -> Iterator[Finding]:
     centers = camera_centers(cameras)
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     # Where they do, the extent is not theirs but the distance of the points (`scene_extent`).
-    if len(centers) > 1 and info.extent and spread < NARROW * info.extent:
+    if len(centers) > 1 and info.extent and spread < NARROW * info.extent and not any(wrong_forms(info)):
         text = f"all cameras stand in one place, {spread:.2g} units apart and {info.extent:.2g} from the points"
         text += ", so depth cannot be found"
         yield Finding(text, "take photos from places some steps apart, or give cameras and points in one unit")
@@ -192,6 +216,8 @@ def check_lenses(source: str, views: Sequence[CameraInfo]) -> Iterator[Finding]:
 
 def check_extent(info: SceneInfo) -> Iterator[Finding]:
     """Scale of the scene."""
+    if any(wrong_forms(info)):
+        return
     low, high = EXTENT
     if low <= info.extent <= high:
         factor = enlargement(info)

@@ -12,6 +12,7 @@ from scene.gaussians.copies import places_of
 from scene.readers.info import SceneInfo, camera_centers
 from scene.readers.tracks import projected
 from splatting.findings import Finding, fine
+from splatting.findings.cameras import OTHER_FORMS
 from splatting.host.listing import some
 
 FEWEST_POINTS = 1000  # with fewer, density control has to find the scene by itself
@@ -19,6 +20,7 @@ FAR_POINT = 100.0  # extents from the cameras; a sky is some tens away
 FAR_SHARE = 0.01
 FEWEST_IN_VIEW = 10  # points of the cloud in a photo
 _UNSEEN = 0.5
+_OF_ANOTHER_FORM = 0.2  # share of the cameras without points
 _SAMPLE = 5000  # most points tested against the views,
 _TESTS = 1_000_000  # and most tests
 
@@ -34,8 +36,8 @@ def check_cloud(info: SceneInfo) -> Iterator[Finding]:
 
 
 def of_points(info: SceneInfo) -> Iterator[Finding]:
-    """What is wrong with the points; nothing where a model is loaded and there are none."""
-    if info.point_cloud is None or not len(info.point_cloud.points):
+    """What is wrong with the points; nothing where there are none, as for a loaded model, or random ones."""
+    if info.point_cloud is None or not len(info.point_cloud.points) or info.has_random_points:
         return
     points = np.asarray(info.point_cloud.points, dtype=np.float64)
     if not np.isfinite(points).all():
@@ -66,9 +68,11 @@ def _unseen(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
     unseen = float((~seen.any(axis=0)).mean())
     counts = seen.sum(axis=1) * len(points) / seen.shape[1]
     away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
-    if unseen > _UNSEEN:
-        remedy = "poses and points do not belong together: check the axes (x right, y down, z forward) and the scale"
-        yield Finding(f"{unseen:.0%} of the points are in no photo", remedy)
-    elif away and len(points) >= 2 * FEWEST_IN_VIEW:
-        text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
+    if len(points) < 2 * FEWEST_IN_VIEW:
+        away = []
+    text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
+    if unseen > _UNSEEN or len(away) >= max(2, _OF_ANOTHER_FORM * len(counts)):
+        text = f"{unseen:.0%} of the points are in no photo" if unseen > _UNSEEN else text
+        yield Finding(f"{text}: poses and points do not belong together", OTHER_FORMS)
+    elif away:
         yield Finding(text, "remove them from the model: they face away from the scene, or their poses are wrong")

@@ -77,7 +77,7 @@ class TimeBudget(Part):
         from scene.gaussians.density_rules import band_rate
         from splatting.parts.time_budget_schedule import AN_ITERATION, SHORT
 
-        run.schedule.random = _is_random(run.scene)
+        run.schedule.random = run.scene.info.has_random_points
         run.schedule.short = SHORT[run.device.type]
         cameras = run.scene.getTrainCameras()
         run.schedule.megapixels = run.scene.training_pixels()[0] / len(cameras) / 1e6
@@ -103,16 +103,6 @@ class TimeBudget(Part):
 
         if self._iteration:
             write_schedule(Path(scene.model_path) / SCHEDULE, self._run.schedule.up_to(self._iteration))
-
-
-def _is_random(scene: "Scene") -> bool:
-    """Whether a scene has no points but random ones."""
-    from scene.readers.start_cloud import RANDOM_POINTS
-
-    cloud = scene.info.point_cloud
-    if cloud is None or scene.info.ply_path is not None or len(cloud.points) != RANDOM_POINTS:
-        return False
-    return bool((cloud.colors == cloud.colors[0]).all())
 
 
 class Sizes:

@@ -44,7 +44,7 @@ from splatting.training.objective import LossWatch, Objective
 from splatting.training.save import Checkpoints
 from splatting.training.schedule import Schedule
 from splatting.training.trim_report import TrimReport, trimmed
-from splatting.training.watch import DivergenceWatch
+from splatting.training.watch import DivergenceWatch, check_drawn
 from utils.system_utils import UserError, compute_device
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree
@@ -104,6 +104,8 @@ class Run:
         self._begin_model(capture, first, states)
         check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
         check_views(self.pipe, self.scene.getTestCameras())
+        if capture is None:
+            check_drawn(self)
         self._check_records()
         self.strategy = self._choose_strategy(states)
         self.objective = Objective(self)

@@ -10,8 +10,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from gaussian_renderer import shown_by
 from scene.cameras import Camera
 from scene.gaussians.adam import StepGuard
+from splatting.findings.points import OTHER_FORMS
 from splatting.host.listing import some
 from splatting.part import Error, Part
 from splatting.training.iteration import Iteration, Losses
@@ -92,6 +94,15 @@ class DivergenceWatch(Part):
                 "the learning rates, or check poses and photos (doctor.py)",
                 file=sys.stderr,
             )
+
+
+def check_drawn(run: "Run") -> None:
+    """Refuse a start that no view shows (UserError), as no step would change anything. Every rank calls it."""
+    views = run.scene.getTrainCameras()
+    for view in views:
+        if run.group.numbers(int(shown_by(view, run.gaussians, run.pipe).any())).any():
+            return
+    raise UserError(f"none of the {len(views)} training views shows any Gaussian of the start; {OTHER_FORMS}")
 
 
 _ENOUGH = 100  # if so many views have no pixel that counts, and no view has one, the masks are wrong

@@ -562,7 +562,7 @@ def test_the_clock_ends_growth_at_the_pace_of_whole_views_and_removes_nothing(si
     ("device", "photos", "wanted"), [("cuda", 20, 25), ("cuda", 75, 37.5), ("cuda", 300, 50), ("cpu", 300, 25)]
 )
 def test_many_photos_on_a_gpu_train_more_gaussians(device, photos, wanted):
-    info = SimpleNamespace(point_cloud=None, ply_path=None)
+    info = SimpleNamespace(has_random_points=False)
     scene = SimpleNamespace(
         getTrainCameras=lambda: [None] * photos, training_pixels=lambda: (1e6, 1), images=None, info=info
     )
