@@ -39,6 +39,7 @@ from splatting.camera_paths.without_scene import WithoutScene, circle, record_of
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
 from splatting.exports.cleaning import check_clean, clean_scene, write_comparison
 from splatting.exports.formats import FORMATS, Around, Format, format_of
+from splatting.exports.notes import read_notes
 from splatting.exports.reading import ANY, read_any
 from splatting.exports.upright import add_upright_options, check_upright, oriented_later, placed
 from splatting.files.json_files import read_model_json
@@ -247,6 +248,8 @@ def _check_fitting(args: argparse.Namespace, entries: Sequence[Format]) -> None:
         if getattr(args, option) and not any(option in entry.options for entry in entries):
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
+    if args.notes:
+        read_notes(args.notes)
 
 
 def _check_views(
@@ -257,7 +260,6 @@ def _check_views(
     A warning if the views are not those of the training.
     """
     from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
-    from splatting.exports.notes import read_notes
     from splatting.exports.page_start import named
 
     if not args.ply:
@@ -306,7 +308,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     add("--clean", **CLEAN_OPTION, help="leave out floaters and what else the training views do not need, while none "
         "loses more than this (default: off; 0.05 without a number)")  # fmt: skip
     add("--max_splats", type=int, default=0, metavar="N",
-        help="keep N Gaussians; what adds least to the training views goes first (default: 0, no limit)")  # fmt: skip
+        help="keep N Gaussians; what adds least to the training views goes first (default: no limit)"
+        ).above_zero = True  # fmt: skip
     add("--path", metavar="PATH",
         help="animation of an .html: interpolate, ellipse, spiral, or a JSON file of keyframes "
         "(default: around the model, or a sway if the first camera is within it)")  # fmt: skip
@@ -335,7 +338,7 @@ def parse(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) ->
     if not 0 <= args.min_opacity <= 1:
         raise UserError(f"--min_opacity must be from 0 to 1, got {args.min_opacity}")
     if args.max_splats < 0:
-        raise UserError(f"--max_splats must be 0, no limit, or above, got {args.max_splats}")
+        raise UserError(f"--max_splats must be above 0, got {args.max_splats}")
     check_clean(args.clean)
     if args.raw and args.clean:
         raise UserError("--raw and --clean contradict each other; leave one out")

@@ -42,13 +42,16 @@ class OptionParser(argparse.ArgumentParser):
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
         try:
-            return super()._get_value(action, text)
+            value = super()._get_value(action, text)
         except argparse.ArgumentError as error:
             if action.type not in _NUMBERS:
                 raise
             about = re.split(r"; |\. | ?\(", action.help or "")[0]
             said = f"takes {_NUMBERS[action.type]}" + (f" ({about})" if about else "")
             raise argparse.ArgumentError(action, f"{said}, got {text!r}") from error
+        if value == 0 and getattr(action, "above_zero", False):
+            raise argparse.ArgumentError(action, "must be above 0; leave it out for its default")
+        return value
 
     def error(self, message: str) -> NoReturn:
         message = re.sub("ignored explicit argument (.*)", r"takes no value, got \1; give it alone", message)

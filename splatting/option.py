@@ -40,6 +40,7 @@ class Option:
     loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
     called: the default where a program calls `train.training`, if it is another one there.
     topic: its group in train.py's help, one of TOPICS. unset: what the help shows as the default, if not the value.
+    above_zero: whether a typed 0, which would count as not given, is refused.
     """
 
     name: str
@@ -56,6 +57,7 @@ class Option:
     after: str = ""
     topic: str = NUMBERS
     unset: str = ""
+    above_zero: bool = False
 
     @property
     def ours(self) -> bool:
@@ -76,7 +78,8 @@ class Option:
         else:
             kind = {"type": type(self.default), "metavar": self._metavar()}
         action = group.add_argument(*flags, **kind, default=default, help=text.replace("%", "%%"))
-        action.ours, action.topic = self.ours, self.topic  # type: ignore[attr-defined]  # for the parsers of arguments/
+        for name in ("ours", "topic", "above_zero"):  # for the parsers of arguments/
+            setattr(action, name, getattr(self, name))
 
     def _shown(self) -> str:
         return "off" if self.default is False else "none" if self.default == "" else str(self.default)

@@ -3,6 +3,7 @@
 import argparse
 
 import pytest
+import torch
 
 import train
 from arguments import (
@@ -98,6 +99,22 @@ def test_short_help_fits_on_two_screens_and_names_all_topics(capsys, monkeypatch
 def test_absurd_values_name_their_option(option, value):
     with pytest.raises(UserError, match=f"^--{option} "):
         _parse(f"--{option}={value}")
+
+
+@pytest.mark.parametrize("name", ["time_budget", "gpu_memory", "max_num_splats", "images_to_load"])
+def test_a_typed_zero_that_would_count_as_not_given_is_refused(capsys, name):
+    with pytest.raises(SystemExit) as exit_info:
+        train.main(["-s", "absent", f"--{name}", "0"])
+    assert exit_info.value.code == 2
+    assert f"argument --{name}: must be above 0; leave it out for its default" in capsys.readouterr().err
+
+
+def test_a_limit_of_a_gpus_memory_without_a_gpu_is_refused(colmap_scene, tmp_path):
+    if torch.cuda.is_available():
+        pytest.skip("there is a GPU")
+    with pytest.raises(UserError, match="--gpu_memory limits the memory of a GPU, and there is none to use"):
+        train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "--gpu_memory", "4"])
+    assert not (tmp_path / "out").exists()
 
 
 # Groups as code for the reference writes them

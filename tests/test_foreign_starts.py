@@ -255,7 +255,11 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     ("words", "said"),
     [
         ("--ply a.ply --min_opacity 2", "--min_opacity must be from 0 to 1, got 2.0"),
-        ("--ply a.ply --max_splats -1", "--max_splats must be 0"),
+        ("--ply a.ply --max_splats -1", "--max_splats must be above 0"),
+        (
+            f"--ply a.ply --to b.html --notes {Path(__file__).with_name('pyramid_60.json')}",
+            "pyramid_60.json is no plain text; write it as docs/guide/w",
+        ),
         ("--ply a.ply --crop 1 0 0 0 1 1", "--crop takes the smaller corner first"),
         ("--ply a.ply --max_splats 5", "need training views"),
         ("--ply absent.ply", "no file absent.ply; give a model as PLY"),

@@ -38,7 +38,7 @@ class WorkloadRun(Run):
     def __init__(self, workload: Workload, steps: int, still: bool, sleep: bool = False, gpu_memory: float = 0) -> None:
         self.group = ranks()
         words = ["-s", ".", "--iterations", str(steps), "--densify_from_iter", "10000", *_STILL * still]
-        words += ["--strategy", "adc", "--gpu_memory", str(gpu_memory)]
+        words += ["--strategy", "adc", *(["--gpu_memory", str(gpu_memory)] if gpu_memory else [])]
         self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
         self.first_iteration = 0
         self.interrupt, self.device = DeferredInterrupt(), compute_device()

@@ -20,6 +20,7 @@ from splatting.host.errors import UserError
 
 _MOST = 25  # views, which the viewer takes
 _LONGEST_TEXT = 1000  # letters of a note, which the viewer shows in a box
+_NO_TEXT = re.compile(r"\s*([{<]|\[\s*[\[{\"])")  # JSON, RTF, HTML
 _FACT = re.compile(r"([^\W\d_][\w ]{0,30}):\s*(\S.*)")
 
 
@@ -46,6 +47,8 @@ def read_notes(path: str) -> Notes:
         content = Path(path).read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"--notes {path} cannot be read as UTF-8 text ({error}); give a text file") from error
+    if _NO_TEXT.match(content):
+        raise UserError(f"--notes {path} is no plain text; write it as docs/guide/web_pages.md shows, from # Title on")
     before, *parts = re.split(r"^(##?)[ \t]+(.*)$", content, flags=re.MULTILINE)
     title, facts, text, views = "", (), before.strip(), []
     for place, (marks, heading, body) in enumerate(zip(parts[::3], parts[1::3], parts[2::3], strict=True)):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from splatting.option import Option, within
 from splatting.part import Error, Options, Part, fill
+from utils.system_utils import UserError
 
 if TYPE_CHECKING:
     import argparse
@@ -28,9 +29,10 @@ class Spill(Part):
     name = "spill"
     # fmt: off
     options = Options(optimisation=(
-        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
-            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
-                 "not fit are kept in the host's memory; slower, with the same result"),
+        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory", above_zero=True,
+            unset="all",
+            help="GiB of the GPU's memory that training may use. SH bands above 0 and their Adam state that do not fit "
+                 "are kept in the host's memory; slower, with the same result"),
     ))
     # fmt: on
 
@@ -42,6 +44,8 @@ class Spill(Part):
         from splatting.parts.spill_memory import GpuMemory, release_torch
         from splatting.registry import part_class, strategies
 
+        if run.opt.gpu_memory:
+            refuse_without_gpu(run.device.type)
         release_torch()  # from the limit of a training that was refused after this
         self._model = run.gaussians
         absolute = any(part_class(name).takes_absolute(run.opt) for name in strategies())
@@ -62,6 +66,12 @@ class Spill(Part):
         from splatting.parts.spill_memory import release_torch
 
         release_torch()
+
+
+def refuse_without_gpu(device: str) -> None:
+    """UserError where there is no memory to limit."""
+    if device != "cuda":
+        raise UserError("--gpu_memory limits the memory of a GPU, and there is none to use; leave it out")
 
 
 def announce(run: Any, memory: "GpuMemory") -> None:

@@ -29,9 +29,9 @@ class TimeBudget(Part):
     # fmt: off
     options = Options(optimisation=(
         Option("time_budget", 0.0, origin="ours", compared=False, topic=MOST_NEEDED,
-            check=within(0, 31_536_000),  # a year
-            help="seconds to train, without scores and saves, or more if a finished run is resumed; 0: no "
-                 "limit. The schedule of --iterations is fitted into them, with 25 to 50 Gaussians for each "
+            above_zero=True, unset="none", check=within(0, 31_536_000),  # a year
+            help="seconds to train, without scores and saves, or more if a finished run is resumed. "
+                 "The schedule of --iterations is fitted into them, with 25 to 50 Gaussians for each "
                  "iteration. --strategy auto then means budget, or mcmc for at most 50 photos on a GPU with 0.25 "
                  "s or more for each"),
         Option("schedule", "", origin="ours", compared=False, topic="quality and speed",

@@ -32,6 +32,7 @@ from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting.distributed.ranks import ranks
 from splatting.findings import resources
 from splatting.findings.resources import training_bytes
+from splatting.parts import spill as spill_part
 from splatting.parts import spill_memory as gpu_memory
 from splatting.parts.spill import sentences
 from splatting.parts.spill_memory import GpuMemory, resident_rows, spillable_bytes
@@ -194,6 +195,7 @@ def _half_spilled(patch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     patch.setattr(spilled.OPERATORS, "spilled_bytes", found)
     patch.setattr(GpuMemory, "resident_rows", lambda self, count: count // 2)
     patch.setattr(GpuMemory, "_spills", lambda self, count: self.limit > 0)
+    patch.setattr(spill_part, "refuse_without_gpu", lambda device: None)
     patch.setattr(gpu_memory, "_PAGE", PAGE if torch.cuda.is_available() else 1)
     yield made
 
@@ -251,6 +253,7 @@ def test_ranks(scene, tmp_path, once):
 @pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, "--strategy", "mcmc"), False)])
 def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
     monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
+    monkeypatch.setattr(spill_part, "refuse_without_gpu", lambda device: None)
     found, begin = [], run.Run.open
     monkeypatch.setattr(run.Run, "open", lambda self, *x: (found.append(self.sleeping is not None), begin(self, *x)))
     trained(scene, tmp_path, *options)

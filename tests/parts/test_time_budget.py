@@ -524,7 +524,7 @@ def test_few_photos_and_much_time_on_a_gpu_take_mcmc(views, seconds, device, str
 def test_no_strategy_grows_beyond_what_the_clock_can_train(colmap_scene, tmp_path, monkeypatch, strategy):
     """Some 60 iterations train 1,500 Gaussians; without the clock there are more."""
     _timed(monkeypatch, lambda t: 0.1)
-    words = "--strategy", strategy, "--densify_grad_threshold", 1e-7, "--mcmc_growth", 0.1, "--max_num_splats", 0
+    words = "--strategy", strategy, "--densify_grad_threshold", 1e-7, "--mcmc_growth", 0.1
     by_clock = _train(colmap_scene, tmp_path / "a", *words, "--time_budget", 6)
     without = _train(colmap_scene, tmp_path / "b", *words, "--iterations", 60, "--densification_interval", 2,
                      "--densify_from_iter", 2, "--max_num_splats", 3000)  # fmt: skip
