@@ -23,7 +23,7 @@ from scene.images.find import SideFiles
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.photos import undistorted_folder
-from splatting.files.image_files import UNREADABLE, open_image
+from splatting.files.image_files import UNREADABLE, open_image, plane_scale
 from splatting.files.plain_files import plain, plain_text
 from splatting.host.listing import some
 from splatting.host.machine import threads
@@ -168,7 +168,10 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
             cameras = _with_colmap_maps(info.train_cameras, paths, scene, folder)
         else:
             pairs = zip(info.train_cameras, paths, strict=True)
-            cameras = [with_map(camera, path, None, BLENDER_UNIT) for camera, path in pairs]
+            # Inverse depth that render.py has written tells its unit.
+            cameras = [
+                with_map(camera, path, None, 1 / (plane_scale(path) or 1 / BLENDER_UNIT)) for camera, path in pairs
+            ]
     _check_files([camera for camera in cameras if camera.depth])
     return replace(info, train_cameras=_with_depth(cameras, folder))
 

@@ -1,6 +1,7 @@
 """Fit of a scene's depth maps to its COLMAP points: scale and offset of each, or one scale of all metric maps."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +11,14 @@ from scene.colmap_loader import Camera, Image, Points, qvec2rotmat
 from scene.images.find import SideFiles
 from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
 from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, map_names, read_values, sample
+from scene.readers.info import SceneInfo
+from scene.readers.tracks import projected
 from splatting.host.progress import Bar
 from utils.system_utils import UserError, atomic_write
 
 _WITH_POINTS = "export the model with the 2D points of its photos, or train without depth maps"
+_POINTS, _VIEWS = 5000, 16  # that are looked at before a training
+_OPPOSITE = -0.1  # rank correlation with what maps should be, below which they are the opposite
 UNIT = 65535.0  # of a map's values in the fit
 MIN_POINTS = 11
 MIN_RANGE = 1e-3  # of the points' inverse depths, 1 / world units
@@ -27,20 +32,23 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     can be fitted, or the scene has no COLMAP model.
     """
     folder, model = _model(scene, model_type)
-    table, most = {}, 0
+    table, most, found = {}, 0, []
     paths = _maps(scene, depths, model, None)
     for image, path in _in_pairs(model, paths):
         camera = model.cameras[image.camera_id]
         pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
         name = Path(image.name).with_suffix("").as_posix()
         if path is not None:
-            scale, offset = fit_image(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
+            values, z = _samples(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
+            found.append((values, z))
+            scale, offset = fit_line(values, 1 / z)
             table[name] = {"scale": scale, "offset": offset}
             most = max(most, len(z))
     if not table:
         raise UserError(
             f"no depth map in {depths} belongs to a photo of {folder}; name maps like the photos, with .png"
         )
+    check_direction(found, depths)
     if not any(entry["scale"] for entry in table.values()):
         raise UserError(
             f"none of {len(table)} maps in {depths} can be fitted: the photos of {folder} as .{model_type} see {most} "
@@ -64,9 +72,9 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
             depth = metric._replace(scale=None).map_of(path)
             camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
             pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
-            values, z = _samples(pixels, z, (camera.width, camera.height), values)
-            found.append((values * z)[np.isfinite(values)])
-    ratios = np.concatenate(found) if found else np.zeros(0)
+            found.append(_samples(pixels, z, (camera.width, camera.height), values))
+    check_direction(found, depths, METRIC)
+    ratios = np.concatenate([(values * z)[np.isfinite(values)] for values, z in found]) if found else np.zeros(0)
     if len(ratios) < MIN_POINTS:
         raise UserError(
             f"the maps in {depths} have depths at {len(ratios)} points of {folder}, too few to fit a scale; "
@@ -115,6 +123,44 @@ def sightings(image: Image, points: Points, camera: Camera, model: str) -> tuple
     if camera.model in MODELS and MODELS[camera.model][0] != "perspective":
         return image.xys[has_point], np.linalg.norm(points.xyz[places] @ turn.T + shift, axis=1)
     return image.xys[has_point], points.xyz[places] @ turn[2] + shift[2]
+
+
+def check_maps(info: SceneInfo, depths: Path) -> None:
+    """Refuse the maps of a scene's training views that its points contradict, as `check_direction`."""
+    if info.point_cloud is None or info.has_random_points:
+        return
+    points = np.asarray(info.point_cloud.points, np.float64)[:: 1 + len(info.point_cloud.points) // _POINTS]
+    views, found, metric = [view for view in info.train_cameras if view.depth], [], ""
+    for view in views[:: 1 + len(views) // _VIEWS]:
+        x, y, inside = projected(view, points)
+        local = (points @ view.R + view.T)[inside]
+        z = np.linalg.norm(local, axis=1) if view.native else local[:, 2]
+        values = read_values(view.depth.path)
+        metric = METRIC if view.depth.metric else ""
+        pixels = np.stack([x, y], axis=1)[inside]
+        found.append(_samples(pixels, z, (view.width, view.height), inverses(values) if metric else values))
+    check_direction(found, depths, metric)
+
+
+def check_direction(maps: Sequence[tuple[np.ndarray, np.ndarray]], depths: Path, metric: str = "") -> None:
+    """UserError where values (n,) of most maps, which should be inverse depths, grow with the depths z (n,) of points.
+
+    metric: the file that says that maps are metric, of which values are the inverses; empty: they are not.
+    """
+    found = []
+    for values, z in maps:
+        known = np.isfinite(values)
+        if known.sum() >= MIN_POINTS and min(np.ptp(values[known]), np.ptp(z[known])) > 0:
+            found.append(np.corrcoef(*(order.argsort().argsort() for order in (values[known], -z[known])))[0, 1])
+    if not found or np.median(found) > _OPPOSITE:
+        return
+    is_not, remedy = (
+        "depths, not inverse depths",
+        f'put a file {METRIC} beside them, as {{"{STEP}": 0.001}} for millimetres',
+    )
+    if metric:
+        is_not, remedy = "inverse depths, not depths", f"save them as grey PNGs, without {metric}"
+    raise UserError(f"the values of most maps in {depths} are {is_not}: they change with the points' depths; {remedy}")
 
 
 def fit_image(pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: np.ndarray) -> tuple[float, float]:

@@ -115,6 +115,15 @@ def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | No
         Image.fromarray(steps).save(temporary, pnginfo=text)
 
 
+def plane_scale(path: Path) -> float | None:
+    """Value of a step of a file that `write_plane` wrote; None for other files."""
+    try:
+        with open_image(path) as image:
+            return float(image.text[SCALE])
+    except (*UNREADABLE, AttributeError, KeyError, ValueError):
+        return None
+
+
 def read_plane(path: str | os.PathLike) -> np.ndarray:
     """Read what `write_plane` wrote: (H, W) float64, each within half a step. UserError for a file that is no plane."""
     try:

@@ -45,11 +45,14 @@ class Depths(Part):
 
         from scene.dataset_readers import replaced_reader
         from scene.readers.depth_maps import with_depth_maps
+        from scene.readers.depth_scale import check_maps
         from scene.readers.scene_folder import kind_of
 
         if not fresh or replaced_reader(kind_of(args.source_path)):  # which finds the maps itself
             return info
-        return with_depth_maps(info, Path(args.source_path), args.depths)
+        info = with_depth_maps(info, Path(args.source_path), args.depths)
+        check_maps(info, Path(args.source_path, args.depths))
+        return info
 
     def begin(self, run: Any, state: Any) -> None:
         from utils.general_utils import get_expon_lr_func

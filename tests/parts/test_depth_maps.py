@@ -35,6 +35,7 @@ from scene.readers.depth_maps import (
 )
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
 from scene.readers.info import CameraInfo, SceneInfo
+from splatting.files.image_files import write_plane
 from splatting.parts.depths import depth_loss
 from utils import make_depth_scale
 from utils.loss_utils import inverse_depth_loss
@@ -189,6 +190,14 @@ def test_what_is_missing_or_broken_is_named(scene):
         _depths(scene)
 
 
+def test_renders_of_inverse_depth_tell_their_unit(blender_scene):
+    planes = np.random.default_rng(0).uniform(0.1, 0.4, (4, 30, 40))
+    for index, plane in enumerate(planes):
+        write_plane(blender_scene / f"depths/r_{index}.png", plane)
+    found = _depths(blender_scene, hold_out=True)["r_1"].decode((40, 30))[0].numpy()
+    np.testing.assert_allclose(found, planes[1], atol=1e-4)
+
+
 def test_blender_maps_are_found_by_name_or_by_path(blender_scene):
     for index in range(4):
         _save(np.full((30, 40), 256 * (index + 1), np.uint16), blender_scene / f"depths/r_{index}.png")
@@ -313,6 +322,27 @@ def test_the_command_makes_a_file_that_training_takes(colmap_scene, tmp_path, ca
         assert (params[name]["scale"], params[name]["offset"]) == pytest.approx((scale, offset), rel=0.05, abs=0.02)
     (tmp_path / "maps").rename(colmap_scene / "depths")
     train.main(["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-d", "depths", "--iterations", "3", "-r", "24"])
+
+
+@pytest.mark.parametrize("kind", ["png", "npy"])
+def test_maps_of_the_opposite_kind_are_refused(colmap_scene, kind):
+    """Millimetres without a metric.json, and inverse depth as floats; also where a training finds a fit of them."""
+    model, folder = read_model_of_kind(colmap_scene / "sparse/0", "bin", with_2d_points=True), colmap_scene / "depths"
+    for view in model.images:
+        values = _squares(view, model, lambda z: z if kind == "png" else 1 / z)
+        _save_metric(values, (folder / view.name).with_suffix(""), kind)
+        if kind == "png":
+            next(folder.rglob("metric.json")).unlink()
+    said = (
+        "are depths, not inverse depths.*put a file metric.json" if kind == "png" else "are inverse depths, not depths"
+    )
+    with pytest.raises(UserError, match=said):
+        make_depth_scale.main(["--base_dir", str(colmap_scene), "--depths_dir", str(folder)])
+    _write_params(colmap_scene, {view.name.removesuffix(".png"): {"scale": 1, "offset": 0} for view in model.images})
+    if kind == "npy":
+        (folder / "metric.json").write_text('{"units_per_metre": 1}')
+    with pytest.raises(UserError, match=said):
+        train.main(["-s", str(colmap_scene), "-m", str(colmap_scene / "out"), "-d", "depths", "--iterations", "3"])
 
 
 @pytest.mark.parametrize("kind", ["OPENCV_FISHEYE", "EQUIRECTANGULAR"])
