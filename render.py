@@ -22,12 +22,14 @@ if __name__ == "__main__":
 import argparse
 import copy
 import shutil
+import sys
 import time
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
+import numpy as np
 import torch
 from PIL import Image
 
@@ -53,6 +55,9 @@ from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p,
 
 if TYPE_CHECKING:
     from splatting.camera_paths.without_scene import WithoutScene
+
+_COMPARED, _FEWEST, _SMALL = 24, 6, (32, 32)  # most and fewest views that are compared, and their size in pixels
+_BETTER, _FITTING = 0.9, 0.75  # shares: of other photos that are less like a render than its own, and of such renders
 
 
 def write_views(
@@ -187,6 +192,9 @@ def render_sets(
                 render_set(scene.model_path, "test", method, shown, *drawn, planes=planes, scored=scored)
             else:
                 shutil.rmtree(Path(scene.model_path) / "test" / f"ours_{method}", ignore_errors=True)
+    if ply and not (skip_train and skip_test):
+        folder = Path(scene.model_path) / ("test" if skip_train else "train") / f"ours_{scene.loaded_iter}"
+        warn_if_elsewhere(ply, folder)
 
 
 def _loaded(
@@ -216,6 +224,27 @@ def _loaded(
 
         warn_if_moved(scene.model_path, views)
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+
+
+def warn_if_elsewhere(model: str, folder: Path) -> None:
+    """Warn if most renders of a set are no more like their own photo than like the photos of other views."""
+    names = sorted(path.name for path in (folder / "renders").glob("*.png"))
+    if len(names) < _FEWEST:
+        return
+    names = names[:: -(-len(names) // _COMPARED)]
+    renders, photos = (
+        np.stack([np.asarray(Image.open(folder / side / name).convert("RGB").resize(_SMALL), float) for name in names])
+        for side in ("renders", "gt")
+    )
+    errors = np.abs(renders[:, None] - photos).mean(axis=(2, 3, 4))
+    fit = (errors.diagonal()[:, None] < errors).sum(axis=1) >= _BETTER * (len(names) - 1)
+    if fit.mean() < _FITTING:
+        text = f"{(~fit).sum()} of {len(fit)} renders are no more like their own photo than like others"
+        print(
+            f"warning: {model} may not be where the cameras are, as after a program has turned, moved or scaled it: "
+            f"{text}; export it again in the cameras' frame",
+            file=sys.stderr,
+        )
 
 
 def main() -> None:

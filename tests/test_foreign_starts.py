@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gaussians import options
+from PIL import Image
 from plyfile import PlyData, PlyElement
 from small_splats import splats, written
 
@@ -299,3 +300,15 @@ def test_what_a_format_needs_is_looked_for_before_the_model_is_loaded(tmp_path, 
     monkeypatch.setattr(export, "load", lambda *_, **__: pytest.fail("the model was loaded"))
     with pytest.raises(UserError, match="needs .*; install"):
         export.export(*_export_options("--ply", tmp_path / "a.ply", "--to", tmp_path / f"model{ending}"))
+
+
+@pytest.mark.parametrize("change", [lambda photos: photos, lambda photos: photos[::-1], np.zeros_like])
+def test_a_model_that_was_moved_is_told_of_by_its_renders(tmp_path, capsys, change):
+    photos = np.random.default_rng(0).integers(0, 255, (8, 48, 64, 3)).astype(np.uint8)
+    for side, pictures in (("renders", change(photos) // 2), ("gt", photos)):
+        (tmp_path / side).mkdir()
+        for index, picture in enumerate(pictures):
+            Image.fromarray(picture).save(tmp_path / side / f"{index:05d}.png")
+    render.warn_if_elsewhere("a.ply", tmp_path)
+    said = capsys.readouterr().err
+    assert said == "" if change(photos) is photos else "a.ply may not be where the cameras are" in said
