@@ -36,6 +36,11 @@ BYTES = np.array([[255, 0, 51], [102, 255, 204]])
         "0.25 -1.5 3 -1200 255 0 51\n4 5.5 -6 -800 102 255 204\n",
         "0.25 -1.5 3 255 0 51 0 0 -1\n4 5.5 -6 102 255 204 0.6 0.8 0\n",
         "0.25 -1.5 3 0 0 -1 255 0 51\n4 5.5 -6 0.6 0.8 0 102 255 204\n",
+        "0,25 -1,5 3 255 0 51\n4,0 5,5 -6,0 102 255 204\n",
+        "0,25\t-1,5\t3\t1\t0,0\t2e-1\n4\t5,5\t-6\t0,4\t1\t0,8\n",
+        "x y z intensity red green blue\n0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n",
+        "0.25 -1.5 3 255 0 51 255\n4 5.5 -6 102 255 204 255\n",
+        "0.25 -1.5 3 9 255 0 51\n4 5.5 -6 9 102 255 204\n",
         "# in Gr\xf6\xdfe\n0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
     ],
 )
@@ -138,6 +143,25 @@ def test_bad_arrays(tmp_path, arrays):
     """Also those that pack to a few bytes, of which little is unpacked."""
     np.savez_compressed(tmp_path / "a.npz", **{name: np.array(value) for name, value in arrays.items()})
     _refused_in_little_memory(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.txt", b"0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n", "from the 4th or from the 5th on may be red"),
+        (
+            "a.pcd",
+            b"# .PCD v0.7\nFIELDS x y z rgb\nDATA ascii\n1 2 3 4.8e6\n",
+            "a kind that is not read; save it as PLY",
+        ),
+        ("a.txt", b"LASF\0\0", "a kind that is not read"),
+        ("a.E57", b"ASTM-E57", "a kind that is not read"),
+    ],
+)
+def test_clouds_that_would_be_misread_are_named(tmp_path, name, content, said):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=said):
+        read_point_cloud(tmp_path / name)
 
 
 def test_an_array_of_a_long_header_is_refused_before_it_is_unpacked(tmp_path):

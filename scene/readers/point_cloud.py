@@ -4,7 +4,7 @@ Text has its columns by the names of a header, else by their number. A header is
 or #, as CloudCompare writes it; a count of points may stand before or behind it (.pts). Without a header the columns
 are x y z and red green blue; with one more, an intensity before the colours in files with a count, else any value
 behind them; with three more, normals before or behind the colours. Numbers are split by spaces, tabs, commas or
-semicolons; with semicolons a comma is a decimal point.
+semicolons; with semicolons, or between the digits of numbers apart, a comma is a decimal point.
 """
 
 import io
@@ -38,6 +38,10 @@ _NORMAL = ("nx", "ny", "nz")
 _SH = ("f_dc_0", "f_dc_1", "f_dc_2")
 _COLORS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"), _SH)
 _TEXT_COLORS = (("r", "g", "b"), ("rf", "gf", "bf"), ("red", "green", "blue"))
+# Three or more numbers with commas as decimal points.
+_DECIMAL_COMMAS = re.compile(r"\s*(?=.*\d,\d)([-+]?\d+(,\d+)?(e[-+]?\d+)?(\s+|$)){3,}", re.IGNORECASE)
+_LOOKED_AT = 100  # lines
+_OTHERS = {".pcd": b"# .PCD", ".las": b"LASF", ".laz": b"LASF", ".e57": b"ASTM-E57"}  # and how they begin
 _UNIT = 0.01  # departure of a normal's length from 1 in rounded files of text
 _GREY = 127 / 255
 
@@ -80,6 +84,10 @@ def _read(path: Path) -> BasicPointCloud:
     """The cloud with colours as exact as the file has them."""
     if not os.path.isfile(path):  # Path.is_file raises an error for a name that is too long
         raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
+    if path.suffix.lower() in _OTHERS or any(_begins_with(path, magic) for magic in _OTHERS.values()):
+        raise UserError(
+            f"{path} is a point cloud of a kind that is not read; save it as PLY, for instance by CloudCompare"
+        )
     if is_ply(path) or path.suffix.lower() == ".ply":
         points, colors, normals = _read_ply(path)
     else:
@@ -191,7 +199,7 @@ def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
         lines = path.read_text(encoding=encoding_of(path), errors="replace").splitlines()
         first, header, counted = _text_header(lines)
         lines = lines[first:]
-        if any(";" in line for line in lines[:1]):
+        if any(";" in line or _DECIMAL_COMMAS.fullmatch(line) for line in lines[:_LOOKED_AT]):
             lines = [line.replace(",", ".").replace(";", " ") for line in lines]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about an empty file
@@ -236,7 +244,12 @@ def _columns_of_text(table: np.ndarray, header: list[str], counted: bool) -> tup
     if count == 9:
         return [0, 1, 2], last if _are_normals(table[:, behind]) else behind
     if count == 7:
-        return [0, 1, 2], last if counted or not _are_colors(table[:, behind]) else behind
+        fits = [_are_colors(table[:, columns]) for columns in (behind, last)]
+        varies = [np.ptp(table[:, column]) > 0 for column in (3, 6)]  # a channel does; flags and alpha may not
+        if not counted and all(fits) and varies[0] == varies[1]:
+            raise ValueError("7 columns, of which those from the 4th or from the 5th on may be red green blue; write a "
+                             "first line of names, such as x y z intensity red green blue")  # fmt: skip
+        return [0, 1, 2], behind if not counted and fits[0] and not (fits[1] and varies[1]) else last
     raise ValueError(f"{count} columns, whose first line does not name them")
 
 
