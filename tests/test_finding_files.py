@@ -12,6 +12,7 @@ from PIL import EpsImagePlugin, Image
 from synthetic import HEIGHT, WIDTH, as_text, make_colmap_scene, read
 
 from scene.images.find import find_images
+from scene.images.masks import MaskOptions
 from utils.system_utils import UserError
 
 
@@ -85,6 +86,23 @@ def test_photos_of_another_format_are_used_and_named(colmap_scene, capsys):
     second.unlink()
     with pytest.raises(UserError, match=f"1 of 17 photos .*{second.name}.* on without: .*colmap image_deleter --input"):
         read(colmap_scene)
+
+
+@pytest.mark.parametrize("linked", ["images", "images/left", "masks"])
+def test_names_differ_behind_a_link_too(colmap_scene, linked):
+    """Folders that are links, also with one that leads back to the scene."""
+    for path in (colmap_scene / "images").rglob("*.png"):
+        mask = (colmap_scene / "masks" / path.relative_to(colmap_scene / "images")).with_suffix(".PNG")
+        mask.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
+    for path in (colmap_scene / "images/left").iterdir():
+        path.rename(path.with_suffix(".PNG"))
+    (colmap_scene / "images/left/loop").symlink_to(colmap_scene)
+    (colmap_scene / "store").mkdir()
+    target = (colmap_scene / linked).rename(colmap_scene / "store" / "photos")
+    (colmap_scene / linked).symlink_to(target)
+    views = read(colmap_scene, masks=MaskOptions("masks")).train_cameras
+    assert len(views) == 17 and all(view.mask for view in views)
 
 
 def test_the_largest_of_several_models(colmap_scene, capsys):

@@ -10,7 +10,7 @@ import os
 import sys
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
@@ -51,10 +51,8 @@ class FileIndex:
     def _folded(self) -> dict[str, list[Path]]:
         """Files by folded name, made at the first miss: a large folder takes time."""
         found: dict[str, list[Path]] = {}
-        for folder, _, files in os.walk(self._folder):
-            # A pipe is no file, and whoever opens one waits for ever; a link may lead to nothing.
-            for path in (Path(folder, file) for file in files if os.path.isfile(os.path.join(folder, file))):
-                found.setdefault(_folded(str(path.relative_to(self._folder))), []).append(path)
+        for path in files_below(self._folder):
+            found.setdefault(_folded(str(path.relative_to(self._folder))), []).append(path)
         return found
 
     @cached_property
@@ -77,6 +75,15 @@ class FileIndex:
         """What the folder has, in brackets."""
         there = sorted(str(path.relative_to(self._folder)) for paths in self._folded.values() for path in paths)
         return f" (the folder has {some(there)})" if there else " (the folder is empty)"
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Files in a folder and below it, also behind links; a link to a folder that it lies in is not followed."""
+    for here, folders, files in os.walk(folder, followlinks=True):
+        above = {identity(parent) for parent in (here, *Path(here).absolute().parents)}
+        folders[:] = [name for name in folders if identity(os.path.join(here, name)) not in above]
+        # A pipe is no file, and whoever opens one waits for ever; a link may lead to nothing.
+        yield from (Path(here, file) for file in files if os.path.isfile(os.path.join(here, file)))
 
 
 def _folded(name: str) -> str:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from scene.images.decode import picture_size
-from scene.images.find import SideFiles
+from scene.images.find import SideFiles, files_below
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.photos import undistorted_folder
@@ -79,7 +79,7 @@ class Metric(NamedTuple):
 
         Metric are .npy and .pfm in a folder without a PNG, and PNGs beside a file METRIC that tells their step.
         """
-        path, suffixes = folder / METRIC, {file.suffix.lower() for file in folder.rglob("*")}
+        path, suffixes = folder / METRIC, {file.suffix.lower() for file in files_below(folder)}
         try:
             told = json.loads(plain_text(path)) if path.is_file() else {}
             step, scale = (None if told.get(key) is None else float(told[key]) for key in (STEP, SCALE))
