@@ -31,7 +31,7 @@ class ModelParams(OptionTable):
             topic=MOST_NEEDED, unset="a new folder under ./output, named after OAR_JOB_ID or the scene",
             help="model folder"),
         Option("images", "images", short="i", stored=CFG_ARGS, topic="data",
-            help="folder of the photos inside the scene folder (COLMAP only)"),
+            help="folder of the photos inside the scene folder, in place of that which a camera file names"),
         *options_of("model"),
         Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS, topic=MOST_NEEDED,
             help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "

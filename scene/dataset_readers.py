@@ -66,7 +66,8 @@ def read_scene(
 ) -> SceneInfo:
     """Read the dataset in a folder, of any kind. UserError says what was looked for and what was found.
 
-    images: folder of the photos (COLMAP only). hold_out: keep a test set apart, else all views train.
+    images: folder of the photos; another than "images" also replaces that which a camera file names. hold_out: keep a
+    test set apart, else all views train.
     init_pcd_path: points, or a file of them, to start from instead of the dataset's own. Without one, init_type
     decides: "sfm" (the dataset's points) or "random". want_cloud: False reads no points, for a model that exists
     already. offset: (3,) of that model's frame (scene/readers/info.py); None: computed for this scene.

@@ -14,6 +14,7 @@ from PIL import Image
 from synthetic import FakeGaussians, edit_json, folder_state, make_nerfstudio_scene, options_of, read
 
 from scene import Scene
+from scene.dataset_readers import read_scene
 from scene.images.lens import Lens
 from scene.readers.transforms import read_poses
 from scene.readers.transforms_lens import lens_of
@@ -305,3 +306,28 @@ def test_frames_have_their_own_intrinsics(scene, blender_scene):
     cameras = read(blender_scene).train_cameras
     assert (cameras[1].fx, cameras[1].fy, cameras[1].cx, cameras[1].cy) == (33, 31, 18, 15)
     assert (cameras[0].FovX, cameras[0].fy) == (pytest.approx(0.7), 31)
+
+
+@pytest.mark.parametrize("place", ["images_4", "../resized_images", "photos"])
+def test_photos_in_another_folder_than_the_file_names(scene, place):
+    """As of DL3DV and ScanNet++, or as -i says; also in the lists of training and test photos."""
+    names = [f"images/{path.relative_to(scene / 'images')}" for path in sorted((scene / "images").rglob("*.png"))]
+    edit_json(
+        scene / "transforms.json", lambda content: content.update(train_filenames=names[4:], test_filenames=names[:4])
+    )
+    whole = read(scene, hold_out=True)
+    for path in (scene / "images").rglob("*.png"):
+        Image.open(path).resize((48, 32)).save(path)
+    (scene / "images").rename(scene / place)
+    (scene / "images").mkdir()
+    images = place if place == "photos" else "images"
+    info = read_scene(scene, images, hold_out=True)
+    assert [view.image_name for view in info.test_cameras] == [
+        name.image_name.replace("images", place, 1) for name in whole.test_cameras
+    ]
+    (view, *_), first = info.train_cameras, whole.train_cameras[0]
+    assert view.fx / view.width == pytest.approx(first.fx / first.width) and len(info.train_cameras) == 13
+    with pytest.raises(
+        UserError, match="17 of 17 photos that .* lists are not in the folder of -i images_2: .*leave -i"
+    ):
+        read_scene(scene, "images_2", hold_out=True)

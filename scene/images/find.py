@@ -144,6 +144,44 @@ def find_listed(
     return [others.get(name, path) for name, path in zip(names, paths, strict=True)], others
 
 
+def other_folder(file: Path, names: Sequence[str], images: str, suffixes: Sequence[str]) -> Path | None:
+    """The folder of photos that a camera file names otherwise: the one that is given, or one that has all of them.
+
+    None where photos lie as the file names them, or nowhere. images: as given by -i; empty or "images": not given. A
+    message says which folder is taken. UserError where a given one lacks photos.
+    """
+    base = file.parent
+    if images not in ("", "images"):
+        lacking = [name for name, path in zip(names, find_in(base / images, names, suffixes), strict=True) if not path]
+        if lacking:
+            raise UserError(
+                f"{len(lacking)} of {len(names)} photos that {file} lists are not in the folder of -i {images}: "
+                f"{some(lacking)}; name the folder that has them, or leave -i out"
+            )
+        return base / images
+    if None not in find_listed(FileIndex(base), names, suffixes)[0]:
+        return None
+    tops = {_below(name).split("/")[0] for name in names if "/" in _below(name)}
+    others = [f"{top}_{factor}" for top in sorted(tops) for factor in (2, 4, 8)]
+    for other in (*others, "images", os.path.join(os.pardir, "resized_images"), os.path.join(os.pardir, "images")):
+        if (base / other).is_dir() and None not in find_in(base / other, names, suffixes):
+            print(f"the photos are not where {file} says, so those in {base / other} are used", file=sys.stderr)
+            return base / other
+    return None
+
+
+def find_in(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> list[Path | None]:
+    """The files of photos in another folder than the one named: by the longest part of each name that is there."""
+    index, below = FileIndex(folder), list(map(_below, names))
+    spelled = [[part + suffix for part in parts for suffix in ("", *suffixes)] for parts in endings_of(below)]
+    return [index.find(*parts) for parts in spelled]
+
+
+def _below(name: str) -> str:
+    """A name without what leads out of a folder."""
+    return "/".join(part for part in name.replace("\\", "/").split("/") if part not in ("", os.curdir, os.pardir))
+
+
 def _in_another_format(index: FileIndex, names: Sequence[str], paths: Sequence[Path | None]) -> dict[str, Path]:
     """Files of missing photos that were converted, by name: one of the same name but for its suffix, of no other."""
     missing = {name for name, path in zip(names, paths, strict=True) if path is None}

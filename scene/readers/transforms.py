@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from scene.images.decode import picture_sizes
-from scene.images.find import FileIndex, find_images, find_listed, identity
+from scene.images.find import FileIndex, find_images, find_in, find_listed, identity, other_folder
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.holdout import EVERY, held_out, refuse_rule, split
@@ -59,13 +59,14 @@ def read_blender(
 
     Without hold_out, test views train, too, and are left out with a message where their file or photos are missing. A
     scene without a cloud of its own starts from grey points spread evenly over a cube. suffixes: of photos that the
-    files name without one. Other arguments and errors as for `scene.dataset_readers.read_scene`; images has no effect.
+    files name without one. Other arguments and errors as for `scene.dataset_readers.read_scene`.
     """
     files = [folder / "transforms_train.json", folder / "transforms_test.json"]
     for path in files[: 2 if hold_out else 1]:
         if not path.is_file():
             raise UserError(f"no {path.name} in {folder}, which --eval needs; export it, or leave --eval out")
-    train, test = read_frames(files[0], masks, suffixes), _test_frames(files[1], masks, suffixes, hold_out)
+    train = read_frames(files[0], masks, suffixes, images)
+    test = _test_frames(files[1], masks, suffixes, images, hold_out)
     if hold_out:
         train, test = _apart(_once(train, str(files[0])), held_out(_once(test, str(files[1]))), folder)
     else:
@@ -80,7 +81,6 @@ def read_blender(
         ply = _ply_in(folder)
         return StartCloud(read_point_cloud(ply), ply) if ply else StartCloud(random(), None, is_random=True)
 
-    _say_if_unused(images, files[0], train)
     lacking = f"{folder / 'points3d.ply'} has no points"
     return scene_info((train, test), start, own, random, lacking, is_nerf_synthetic=True)
 
@@ -99,16 +99,20 @@ def read_poses(path: Path) -> list[Posed]:
     ]
 
 
-def read_frames(path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES) -> list[CameraInfo]:
+def read_frames(
+    path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES, images: str = ""
+) -> list[CameraInfo]:
     """The views of one of a Blender scene's two files, in its order."""
-    return _cameras(path, _read(path), masks, suffixes, by_stem=True)
+    return _cameras(path, _read(path), masks, suffixes, images, by_stem=True)
 
 
-def _test_frames(path: Path, masks: MaskOptions, suffixes: Sequence[str], needed: bool) -> list[CameraInfo]:
+def _test_frames(
+    path: Path, masks: MaskOptions, suffixes: Sequence[str], images: str, needed: bool
+) -> list[CameraInfo]:
     if not needed and not path.is_file():
         return []
     try:
-        return read_frames(path, masks, suffixes)
+        return read_frames(path, masks, suffixes, images)
     except UserError as error:
         if needed:
             raise UserError(f"{error}, or leave --eval out") from error
@@ -167,12 +171,11 @@ def read_nerfstudio(
 
     hold_out: the file's own split if it has one (test_frames, and test_filenames, else val_filenames, are the test
     views), else as `rule` says. Frames may name masks, which --masks replaces. Points come from the file's
-    ply_file_path, else from a points3D.ply beside it. Arguments and errors as for `scene.dataset_readers.read_scene`;
-    images has an effect for Metashape alone.
+    ply_file_path, else from a points3D.ply beside it. Arguments and errors as for `scene.dataset_readers.read_scene`.
     """
     path = camera_file(folder) or folder / "transforms.json"
     content = _read(path, partial(_content, images=images))
-    read = partial(_cameras, path, masks=masks, suffixes=SUFFIXES, by_stem=False, native=native)
+    read = partial(_cameras, path, masks=masks, suffixes=SUFFIXES, images=images, by_stem=False, native=native)
     try:
         cameras = read(content)
     except UserError as error:
@@ -186,7 +189,6 @@ def read_nerfstudio(
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
-    _say_if_unused(images, path, cameras)
     if views := _own_split(path, content, cameras, tests, hold_out):
         refuse_rule(rule, path)
     else:
@@ -250,18 +252,6 @@ def _tells(value: Any) -> bool:
     return bool(np.any(np.array(value, dtype=object)))
 
 
-def _say_if_unused(images: str, path: Path, cameras: Sequence[CameraInfo]) -> None:
-    """Say that -i has no effect, where it names another folder than that of the photos and not the default."""
-    photos = [Path(camera.lying or camera.image_path) for camera in cameras]
-    if images in ("", "images") or any(photo.is_relative_to(path.parent / images) for photo in photos):
-        return
-    print(
-        f"-i {images} is not used: {path.name} names its photos itself, the first is {photos[0]}; leave -i out, change "
-        "file_path in the file, or give -r 2, 4 or 8 for smaller photos",
-        file=sys.stderr,
-    )
-
-
 def _where(path: Path, number: int, frame: Any) -> str:
     name = f" ({frame['file_path']})" if isinstance(frame, dict) and "file_path" in frame else ""
     return f"frame {number}{name:.80} of {path}"
@@ -279,6 +269,7 @@ def _cameras(
     content: dict[str, Any],
     masks: MaskOptions,
     suffixes: Sequence[str],
+    images: str,
     by_stem: bool,
     native: bool = False,
 ) -> list[CameraInfo]:
@@ -287,7 +278,10 @@ def _cameras(
     poses = [_pose(path, number, frame) for number, frame in enumerate(frames, start=1)]
     listed = [str(frame["file_path"]) for frame in frames]
     remedy = f"put them there, or take their frames out of {path.name} to go on without"
-    photos = find_images(path.parent, listed, str(path), remedy, suffixes)
+    if place := other_folder(path, listed, images, suffixes):
+        photos = find_in(place, listed, suffixes)
+    else:
+        photos = find_images(path.parent, listed, str(path), remedy, suffixes)
     names = [os.path.relpath(photo, path.parent) for photo in photos]
     found = _masks(path, frames, names, photos, masks)
     sizes, cameras = picture_sizes(photos), []
@@ -355,12 +349,14 @@ def _own_split(
     if not hold_out:
         return None
     lists, index = [], FileIndex(path.parent)
+    place = path.parent / os.path.commonpath([os.path.dirname(camera.image_name) for camera in cameras])
     for name in SPLITS:
         listed = content.get(name) or []
         if not isinstance(listed, list):
             raise UserError(f"{name} in {path} must be a list of file names; fix it, or leave it out")
         names = [str(entry).translate(_ESCAPED) for entry in listed]
-        lists.append(dict(zip(names, find_listed(index, names, SUFFIXES)[0], strict=True)))
+        found = zip(find_listed(index, names, SUFFIXES)[0], find_in(place, names, SUFFIXES), strict=True)
+        lists.append(dict(zip(names, (own or elsewhere for own, elsewhere in found), strict=True)))
     if not (any(lists[1:]) or tests):
         return None
     photos = [identity(path.parent / camera.image_name) for camera in cameras]
