@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 import torch
 from PIL import Image
-from synthetic import CENTER, FOCAL, FakeGaussians, as_text, folder_state, options_of, read
+from synthetic import CENTER, FOCAL, FakeGaussians, as_text, folder_state, make_colmap_scene, options_of, read
 
 from scene import Scene
 from scene.dataset_readers import scene_extent
@@ -290,3 +290,14 @@ def test_pycolmap_disturbs_neither_png_nor_sigterm(tmp_path):
     done = subprocess.run(command, cwd=Path(__file__).parents[1], capture_output=True, check=False)
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, b"")
     assert Image.open(tmp_path / "a.png").size == (64, 64)
+
+
+@pytest.mark.parametrize("square", [True, False])
+def test_photos_of_another_aspect_than_a_camera_of_square_pixels(tmp_path, capsys, square):
+    make_colmap_scene(tmp_path, params=(110.0, 110.0 if square else 140.0, 45.0, 34.5), views=4)
+    for path in (tmp_path / "images").rglob("*.png"):
+        Image.open(path).crop((0, 0, 64, 64)).save(path)
+    read(tmp_path)
+    said = capsys.readouterr().err
+    assert "4 of 4 photos do not have the aspect ratio of their camera" in said
+    assert ("its pixels are square (fx = fy), so the photos are rather padded or cropped" in said) == square

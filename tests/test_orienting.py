@@ -219,6 +219,26 @@ def test_gravity_of_a_phone_comes_before_horizons(tmp_path, orientation):
     assert record["vertical"] == "gravity of 12 photos"
 
 
+@pytest.mark.parametrize("spelling", ['{}="{}"', "{}>{}</"])
+@pytest.mark.parametrize("longitude", ["GpsLongitude", "GpsLongtitude"])
+@pytest.mark.parametrize(
+    ("pitch", "roll", "down"), [(-90, 0, (0, 0, 1)), (0, 0, (0, 1, 0)), (-30, 90, (0.75**0.5, 0, 0.5))]
+)
+def test_drones_tell_place_and_gravity_in_xmp(tmp_path, spelling, longitude, pitch, roll, down):
+    values = {"GpsLatitude": "+47.123456789", longitude: "-8.5", "AbsoluteAltitude": "+512.25",
+              "GimbalPitchDegree": f"{pitch:+.2f}", "GimbalRollDegree": f"{roll:+.2f}"}  # fmt: skip
+    xmp = " ".join(f"drone-dji:{spelling.format(*one)}" for one in values.items()).encode()
+    for orientation in (1, 6):
+        exif = exif_of(np.array([47.1234, -8.5, 480.0]), orientation=orientation)
+        Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg", exif=exif, xmp=xmp)
+        found = read_place(tmp_path / "a.jpg")
+        assert found.gps == (47.123456789, -8.5, 512.25)
+        if orientation == 1:
+            np.testing.assert_allclose(found.down, down, atol=1e-12)
+        else:  # it is not known what the angles are then of
+            assert found.down is None
+
+
 @pytest.mark.parametrize(
     ("tags", "place"),
     [

@@ -1,6 +1,7 @@
-"""What a photo's EXIF data tell: the lens that took it, where it was taken, and which way was down."""
+"""What a photo's EXIF data, and DJI's XMP, tell: the lens that took it, where it was taken, and which way was down."""
 
 import math
+import re
 import struct
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ _APPLE = b"Apple iOS\0"
 _ACCELERATION = 8  # tag of Apple's notes: three signed rationals (ExifTool, "Apple Tags", AccelerationVector)
 _SIGNED_RATIONAL = 10
 _BELOW = ("\x01", "\x03", "1", "3")  # references of an altitude below the sea, or below the ellipsoid (EXIF 3.0)
+_DJI = re.compile(r'drone-dji:((?:Gps|Gimbal|Absolute)\w+)(?:\s*=\s*["\']|>)\s*([-+]?\d+(?:\.\d+)?)')
 # What turns (right, down) of the stored pixels to those of the upright photo, by EXIF orientation.
 _UPRIGHT = {1: (1, 0, 0, 1), 3: (-1, 0, 0, -1), 6: (0, -1, 1, 0), 8: (0, 1, -1, 0)}
 
@@ -102,11 +104,29 @@ def read_place(photo: Path) -> PhotoPlace:
         with open_image(photo) as image:
             exif = image.getexif()
             gps, more = exif.get_ifd(ExifTags.IFD.GPSInfo), exif.get_ifd(ExifTags.IFD.Exif)
+            xmp = _dji(image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b"")
     except UNREADABLE:
         return PhotoPlace()
-    note = more.get(ExifTags.Base.MakerNote)
-    down = _down(note, exif.get(ExifTags.Base.Orientation, 1)) if isinstance(note, bytes) else None
-    return PhotoPlace(_gps(gps), down)
+    note, orientation = more.get(ExifTags.Base.MakerNote), exif.get(ExifTags.Base.Orientation, 1)
+    down = _down(note, orientation) if isinstance(note, bytes) else None
+    if down is None and orientation == 1 and "GimbalPitchDegree" in xmp:
+        pitch, roll = (math.radians(xmp.get(f"Gimbal{angle}Degree", 0.0)) for angle in ("Pitch", "Roll"))
+        down = np.array([math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch), -math.sin(pitch)])
+    return PhotoPlace(_precise(_gps(gps), xmp), down)
+
+
+def _dji(xmp: bytes | str) -> dict[str, float]:
+    """The numbers that a drone by DJI writes, by their names there: degrees, and metres; pitch is -90 straight down."""
+    text = xmp.decode("utf-8", "replace") if isinstance(xmp, bytes) else xmp
+    return {name: float(value) for name, value in _DJI.findall(text)}
+
+
+def _precise(gps: tuple[float, float, float] | None, xmp: Mapping[str, float]) -> tuple[float, float, float] | None:
+    """A place by DJI's numbers, which have more digits than EXIF's, where there are such."""
+    latitude, longitude = xmp.get("GpsLatitude"), xmp.get("GpsLongitude", xmp.get("GpsLongtitude"))  # as some spell it
+    tags = {ExifTags.GPS.GPSLatitude: latitude, ExifTags.GPS.GPSLongitude: longitude}
+    height = xmp.get("AbsoluteAltitude", gps[2] if gps else math.nan)
+    return _gps({**tags, ExifTags.GPS.GPSAltitude: height}) or gps
 
 
 def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:

@@ -44,6 +44,7 @@ FARTHEST = 1e12  # from the origin, beyond which lie damaged files; there a doub
 # Of the files in the cache; change it when the same input must give other files.
 _UPRIGHT_FORMAT, _UNDISTORTED_FORMAT = b"sRGB", "3"
 _HAS_MASK = "mask"  # text in an undistorted file, yes or no, so that a deleted mask is noticed
+_SQUARE = 0.01  # difference of focal lengths of square pixels
 _TURNS = {
     5: Image.Transpose.TRANSPOSE,
     6: Image.Transpose.ROTATE_270,
@@ -151,7 +152,10 @@ def _check_shapes(cameras: Sequence[CameraInfo]) -> None:
     if others:
         (name, sizes), count = others[0], f"{len(others)} of {len(cameras)} photos"
         fault = "do not have the aspect ratio of their camera and will be stretched"
-        print(f"{count} {fault}; the first is {name} ({sizes})", file=sys.stderr)
+        square = any(camera.image_name == name and abs(camera.fx / camera.fy - 1) < _SQUARE for camera in cameras)
+        remedy = "; its pixels are square (fx = fy), so the photos are rather padded or cropped: use those that the "
+        remedy += "cameras were made for, or give width, height, cx and cy of these"
+        print(f"{count} {fault}; the first is {name} ({sizes}){remedy * square}", file=sys.stderr)
 
 
 def _made(folder: Path, kind: str) -> Path:
