@@ -79,6 +79,8 @@ def main() -> None:
     if args.clean and not args.model_path:
         raise UserError("--clean needs training views of a model; give the model's folder with -m")
     before = bool(args.source_path) and not (args.file or args.model_path)
+    if not (args.file or before or args.model_path):
+        raise UserError("no model given; pass a model folder by -m, a file of a model alone, or a scene by -s")
     args = args if args.file or before else get_combined_args(parser)
     options, pipeline = model_params.extract(args), pipeline_params.extract(args)
     check_port(args.port)

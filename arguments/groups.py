@@ -57,7 +57,7 @@ class ModelParams(OptionTable):
                  "or a checkpoint of train.py, gsplat or nerfstudio; a point cloud is read as by --init_pcd_path"),
         Option("init_type", "sfm", origin="ours", check=one_of("sfm", "random"), topic="data",
             help="points to start from without --init_pcd_path and --init_ply. sfm: the scene's own; random: grey "
-                 "points in the cameras' frusta, or in the reference's cube for Blender scenes"),
+                 "points in the cameras' frusta, or for Blender scenes in the cube that the cameras look at"),
         Option("masks", "", origin="ours", stored=MODEL_JSON, topic="data",
             help="folder of mask files inside the scene folder, or an absolute path; black is masked. A mask has its "
                  "photo's name, with .png, .mask.png or _mask.png appended or with another suffix. Empty: the masks "

@@ -2,6 +2,7 @@
 
 import argparse
 import difflib
+import os
 import re
 from collections.abc import Collection
 from typing import Any, ClassVar, NoReturn
@@ -9,6 +10,7 @@ from typing import Any, ClassVar, NoReturn
 from splatting.option import Option
 
 _FOLDERS = {"-s": "scene", "-m": "model", "--scenes": "scene"}
+_OF_WINDOWS = re.compile(r"([A-Za-z]):([\\/]\S.*|[\w.-]+)")  # a shell may have taken backslashes away
 _TRUTHS = ("true", "false", "yes", "no", "on", "off", "1", "0")
 _NUMBERS = {int: "a whole number in digits alone", float: "a number without a unit"}
 
@@ -38,9 +40,15 @@ class OptionParser(argparse.ArgumentParser):
         name = word.partition("=")[0]
         near = difflib.get_close_matches(name, self._option_string_actions, 1)
         near = near or [flag for flag in _FOLDERS if name == flag[1:3] and flag in self._option_string_actions]
+        near = near or [flag for flag in self._option_string_actions if len(name) == 2 and flag.startswith(f"-{name}")]
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
+        path = None if os.name == "nt" or os.path.exists(text) else _OF_WINDOWS.fullmatch(text)
+        if path and (path[2][0] in "\\/" or action.dest in ("source_path", "model_path")):
+            below = path[2].replace("\\", "/").lstrip("/") if path[2][0] in "\\/" else "..."
+            mounted = f"/mnt/{path[1].lower()}/{below}"
+            raise argparse.ArgumentError(action, f"{text} is a path of Windows; under WSL, type {mounted}")
         try:
             value = super()._get_value(action, text)
         except argparse.ArgumentError as error:

@@ -109,6 +109,21 @@ def test_a_typed_zero_that_would_count_as_not_given_is_refused(capsys, name):
     assert f"argument --{name}: must be above 0; leave it out for its default" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["-s", "C:\\scenes\\fox"], "C:\\scenes\\fox is a path of Windows; under WSL, type /mnt/c/scenes/fox"),
+        (["-m", "d:/my model"], "d:/my model is a path of Windows; under WSL, type /mnt/d/my model"),
+        (["-s", "C:scenesfox"], "under WSL, type /mnt/c/..."),
+        (["-x", "1"], "there is no option -x"),
+    ],
+)
+def test_what_a_user_of_windows_types(capsys, words, said):
+    with pytest.raises(SystemExit):
+        train.main(words)
+    assert said in capsys.readouterr().err
+
+
 def test_a_limit_of_a_gpus_memory_without_a_gpu_is_refused(colmap_scene, tmp_path):
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")

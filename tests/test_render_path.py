@@ -165,7 +165,7 @@ def test_frames_of_an_earlier_run_are_removed_and_nothing_else(run, tmp_path):
         ("--path ellipse --size 401 300", "odd side.* use --size 400 300$"),
         ("--path ellipse --size 0 4", "^--size must be two even numbers of 2 to 16384 pixels, got 0 4$"),
         ("--path ellipse --seconds nan", "^--seconds must be 0.1 to 3600, got nan$"),
-        ("--path elipse", "^--path must be interpolate, ellipse, spiral or a file of keyframes; there is no file"),
+        ("--path elipse", "^--path must be interpolate, ellipse, spiral, top or a file of keyframes; there is no file"),
         ("--path " + "x" * 5000, "^--path must be .*there is no file xxx"),
         ("--path spiral", "^--path spiral needs training cameras that face one way"),
         ("--path broken.json", "broken.json is not JSON"),

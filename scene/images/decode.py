@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from splatting.files.color_profiles import has_other_colors, in_srgb
@@ -115,6 +115,8 @@ def _unreadable(path: Path, error: Exception) -> UserError:
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
     if isinstance(error, Image.DecompressionBombError):
         return UserError(f"{path} has more than {MOST_PIXELS:,} pixels; make it smaller")
+    if isinstance(error, UnidentifiedImageError) and path.suffix.lower() in (".tif", ".tiff"):
+        return UserError(f"{path} is a TIFF of a kind that is not read, as of floats; save it with 8 or 16 bits")
     return UserError(
         f"cannot read {path} ({str(error) or type(error).__name__}); replace it or take it out of the scene"
     )

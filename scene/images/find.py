@@ -161,9 +161,8 @@ def other_folder(file: Path, names: Sequence[str], images: str, suffixes: Sequen
         return base / images
     if None not in find_listed(FileIndex(base), names, suffixes)[0]:
         return None
-    tops = {_below(name).split("/")[0] for name in names if "/" in _below(name)}
-    others = [f"{top}_{factor}" for top in sorted(tops) for factor in (2, 4, 8)]
-    for other in (*others, "images", os.path.join(os.pardir, "resized_images"), os.path.join(os.pardir, "images")):
+    top = os.path.dirname(os.path.commonprefix([os.path.normpath(name) for name in names])) or "images"
+    for other in (f"{top}_2", f"{top}_4", f"{top}_8", "images", "../resized_images", "../images"):
         if (base / other).is_dir() and None not in find_in(base / other, names, suffixes):
             print(f"the photos are not where {file} says, so those in {base / other} are used", file=sys.stderr)
             return base / other
@@ -171,15 +170,9 @@ def other_folder(file: Path, names: Sequence[str], images: str, suffixes: Sequen
 
 
 def find_in(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> list[Path | None]:
-    """The files of photos in another folder than the one named: by the longest part of each name that is there."""
-    index, below = FileIndex(folder), list(map(_below, names))
-    spelled = [[part + suffix for part in parts for suffix in ("", *suffixes)] for parts in endings_of(below)]
-    return [index.find(*parts) for parts in spelled]
-
-
-def _below(name: str) -> str:
-    """A name without what leads out of a folder."""
-    return "/".join(part for part in name.replace("\\", "/").split("/") if part not in ("", os.curdir, os.pardir))
+    """The files of photos in another folder than the one named, as `SideFiles` finds them."""
+    files = SideFiles(folder, names, [""] * len(names), folder)
+    return [files.find(place, lambda name: (name, *(name + one for one in suffixes))) for place in range(len(names))]
 
 
 def _in_another_format(index: FileIndex, names: Sequence[str], paths: Sequence[Path | None]) -> dict[str, Path]:

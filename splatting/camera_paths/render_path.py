@@ -3,7 +3,7 @@
 import argparse
 import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -85,7 +85,7 @@ def path_request(args: argparse.Namespace) -> PathRequest | None:
     if not 1 <= fps <= MOST_FPS:
         raise UserError(f"--fps must be 1 to {MOST_FPS}, got {fps}")
     size = args.size and _checked_size(*args.size)
-    make = path_maker(args.path, args.seconds)
+    make = path_maker(args.path, args.seconds, [TOP])
     find_ffmpeg()
     return PathRequest(Path(args.path).stem, make, fps, size, args.frames)
 
@@ -101,10 +101,10 @@ def _checked_size(width: int, height: int) -> tuple[int, int]:
     return width, height
 
 
-def path_maker(path: str, seconds: float | None = None) -> Callable[["Poses"], TimedPath]:
+def path_maker(path: str, seconds: float | None = None, others: Sequence[str] = ()) -> Callable[["Poses"], TimedPath]:
     """What makes the path that --path names, from the training cameras' poses. UserError for a wrong one.
 
-    seconds: how long a generated path takes; None: 10.
+    seconds: how long a generated path takes; None: 10. others: further names that the command takes.
     """
     from splatting.camera_paths.generated import GENERATED, SECONDS  # SciPy takes a while to import
 
@@ -116,7 +116,9 @@ def path_maker(path: str, seconds: float | None = None) -> Callable[["Poses"], T
     if seconds is not None:
         raise UserError(f"--seconds works with {', '.join(GENERATED)} only; {path} has its own times")
     if not os.path.exists(path):  # unlike Path.exists, it knows that no file has an empty or an endless name
-        raise UserError(f"--path must be {', '.join(GENERATED)} or a file of keyframes; there is no file {path}")
+        raise UserError(
+            f"--path must be {', '.join((*GENERATED, *others))} or a file of keyframes; there is no file {path}"
+        )
     keyframes = KeyframePath(read_camera_path(Path(path)))
     if not LEAST_SECONDS <= keyframes.seconds <= MOST_SECONDS:
         raise UserError(
