@@ -71,7 +71,7 @@ ROWS = [
     *(Row("bonsai800/4", options) for options in ("", _GLOBAL)),
     Row("bonsai800/2", _GLOBAL),
     *(Row("bonsai800/1", options) for options in ("", _SEQUENTIAL, f"{_SEQUENTIAL} {_GLOBAL}")),
-    *map(Row, ("bonsai3200/1", "fox_full", "fox_raw", "monstree_raw", "bonsai_small")),
+    *map(Row, ("bonsai3200/1", "tt_train", "fox_full", "fox_raw", "monstree_raw", "bonsai_small")),
     Row("video", "--video {set}/video.mp4"),
     *map(Row, ("rooms", "phone", "corridor", "two_places", "mirrored", "foreign", "turntable")),
     *map(Row, ("turning0", "turning1", "turning3", "turning30", "poster", "twin_box")),
