@@ -48,7 +48,7 @@ class Overlap(NamedTuple):
 
     @property
     def is_unmatched(self) -> bool:
-        """Whether the photos show different things."""
+        """True if the photos show different things."""
         return self.cells >= _ASKED and self.empty > _SHARE * self.cells
 
 

@@ -264,7 +264,7 @@ def test_colours_that_other_data_tell_are_followed(tmp_path, suffix, options, na
 
 @pytest.mark.parametrize("kind", ["HEIF", "AVIF"])
 def test_code_points_of_heic_and_avif_are_followed(tmp_path, capsys, kind):
-    """Of a P3 picture its colours; of one in PQ a line, as it cannot be shown in sRGB."""
+    """Colours of a P3 picture are converted; PQ gets a line, as it cannot be shown in sRGB."""
     pillow_heif = pytest.importorskip("pillow_heif")
     pillow_heif.register_heif_opener()
     smooth = np.stack([*np.meshgrid(np.arange(60, 252, 3), np.arange(60, 204, 3)), np.full((48, 64), 90)], -1)

@@ -310,7 +310,7 @@ def test_frames_have_their_own_intrinsics(scene, blender_scene):
 
 @pytest.mark.parametrize("place", ["images_4", "../resized_images", "photos"])
 def test_photos_in_another_folder_than_the_file_names(scene, place):
-    """As of DL3DV and ScanNet++, or as -i says; also in the lists of training and test photos."""
+    """Find photos as DL3DV and ScanNet++ have them, or as -i says; also those of lists of training and test photos."""
     names = [f"images/{path.relative_to(scene / 'images')}" for path in sorted((scene / "images").rglob("*.png"))]
     edit_json(
         scene / "transforms.json", lambda content: content.update(train_filenames=names[4:], test_filenames=names[:4])

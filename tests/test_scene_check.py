@@ -155,7 +155,7 @@ def test_pixels_that_all_photos_share(photos, text):
 
 
 def test_other_faults_wait_for_shared_pixels(scene):
-    """As photos with a caption do not fit their points."""
+    """Photos with a caption do not fit their points, either."""
     for path in (scene / "images").rglob("*.png"):
         photo = np.asarray(Image.open(path)).copy()
         photo[40:] = TEXTURE.repeat(2, 0).repeat(2, 1)[: HEIGHT - 40, :WIDTH]

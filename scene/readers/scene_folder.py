@@ -57,7 +57,7 @@ def is_apart(folder: Path) -> bool:
 
 
 class Capture(NamedTuple):
-    """What a folder has: where photos and videos lie, `input` or the folder itself, both, and the photos in itself."""
+    """Photos and videos of a folder, where they lie (`input` or the folder itself), and photos in the folder itself."""
 
     place: Path
     photos: list[Path]
@@ -66,7 +66,7 @@ class Capture(NamedTuple):
 
     @property
     def is_video(self) -> bool:
-        """Whether the videos are the larger kind, or the photos are too few."""
+        """True if the videos are the larger kind, or the photos are too few."""
         photos, videos = (sum(path.stat().st_size for path in paths) for paths in (self.photos, self.videos))
         return bool(self.videos) and (len(self.photos) < FEWEST or videos > photos)
 

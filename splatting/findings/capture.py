@@ -329,7 +329,7 @@ def stages_of(source: str | os.PathLike) -> dict[str, Any]:
 
 
 def is_unfinished(source: str | os.PathLike) -> bool:
-    """Whether a conversion was begun in a folder, and ended before its last stage."""
+    """Return True if a conversion was begun in a folder, and ended before its last stage."""
     return bool(found := stages_of(source)) and not found.get("capture", {}).get("done")
 
 

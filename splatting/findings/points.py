@@ -36,7 +36,7 @@ def check_cloud(info: SceneInfo) -> Iterator[Finding]:
 
 
 def of_points(info: SceneInfo) -> Iterator[Finding]:
-    """What is wrong with the points; nothing where there are none, as for a loaded model, or random ones."""
+    """Check the points; find nothing where there are none, as for a loaded model, or random ones."""
     if info.point_cloud is None or not len(info.point_cloud.points) or info.has_random_points:
         return
     points = np.asarray(info.point_cloud.points, dtype=np.float64)

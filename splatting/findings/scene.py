@@ -51,7 +51,7 @@ def with_way(found: Iterable[Finding], source: str | os.PathLike) -> list[Findin
 
 
 def has_shared_pixels(found: Sequence[Finding]) -> bool:
-    """Whether findings name pixels that all photos share: poses, points and colours may be wrong for that reason."""
+    """Return True if findings name pixels that all photos share: these may spoil poses, points and colours."""
     return any(SHARED_TEXT in one.text for one in found)
 
 

@@ -57,7 +57,7 @@ def _away(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
 
 
 def place_of(shared: np.ndarray) -> str:
-    """Where in the photo pixels (h, w) bool lie, in words."""
+    """Say in words where in the photo pixels (h, w) bool lie."""
     blocks = [block for rows in np.array_split(shared, 3) for block in np.array_split(rows, 3, axis=1)]
     cells = {n for n, block in enumerate(blocks) if block.mean() > max(0.05, 0.25 * shared.mean())}
     if cells == {0, 2, 6, 8}:
