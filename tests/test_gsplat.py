@@ -64,12 +64,21 @@ class Inputs:
 NAMES = ("means", "quats", "scales", "opacities", "colors", "views")
 
 
-def described(given: Inputs, antialiased: bool, eps2d: float) -> dict[str, Tensor]:
-    """Means, depths, conics and opacities on the images of pinholes (Zwicker et al. 2001; Kerbl et al. 2023)."""
+def places(model: str, at: Tensor) -> Tensor:
+    """Where a camera of focal length 1 shows points of its view, (N, 2); a fisheye is equidistant."""
+    away = at[:, :2].norm(dim=1, keepdim=True)
+    if model == "fisheye":
+        return at[:, :2] * torch.atan2(away, at[:, 2:]) / away
+    return at[:, :2] if model == "ortho" else at[:, :2] / at[:, 2:]
+
+
+def described(given: Inputs, antialiased: bool, eps2d: float, model: str = "pinhole") -> dict[str, Tensor]:
+    """Means, depths, conics and opacities on the images (Zwicker et al. 2001; Kerbl et al. 2023)."""
     found = {"means2d": [], "depths": [], "conics": [], "opacities": []}
     for view, K in zip(given.views, given.Ks, strict=True):
         at = given.means @ view[:3, :3].T + view[:3, 3]
         R = view[:3, :3] @ build_rotation(given.quats) * given.scales[:, None]
+        on_image = places(model, at)
         limit = [((size - K[i, 2]) / K[i, i] + 0.15 * size / K[i, i], K[i, 2] / K[i, i] + 0.15 * size / K[i, i])
                  for i, size in enumerate((WIDTH, HEIGHT))]  # fmt: skip
         depth = at[:, 2]
@@ -77,10 +86,13 @@ def described(given: Inputs, antialiased: bool, eps2d: float) -> dict[str, Tenso
         zero = torch.zeros_like(depth)
         J = torch.stack([K[0, 0] / depth, zero, -K[0, 0] * t[0] / depth,
                          zero, K[1, 1] / depth, -K[1, 1] * t[1] / depth], 1).view(-1, 2, 3)  # fmt: skip
+        if model != "pinhole":  # whose rays alone are clamped
+            rows = [torch.autograd.grad(on_image[:, i].sum(), at, create_graph=True)[0] for i in (0, 1)]
+            J = K.diagonal()[:2, None] * torch.stack(rows, 1)
         flat = J @ R @ R.mT @ J.mT
         wide = flat + eps2d * torch.eye(2, dtype=DOUBLE)
         inverse = wide.inverse()
-        found["means2d"].append(torch.stack([K[i, i] * at[:, i] / depth + K[i, 2] for i in (0, 1)], 1))
+        found["means2d"].append(on_image * K.diagonal()[:2] + K[:2, 2])
         found["depths"].append(depth)
         found["conics"].append(torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], 1))
         factor = (flat.det() / wide.det()).clamp_min(0).sqrt() if antialiased else 1
@@ -133,6 +145,28 @@ def test_images_and_gradients_are_those_of_plain_compositing(mode, form):
                 got, wanted = got[:, :3], wanted[:, :3]  # the last row of a pose is no input
             scale = wanted.abs().max().clamp_min(1e-9)
             assert (got - wanted).abs().max() < 1e-9 * scale, (name, seed)
+
+
+@pytest.mark.parametrize("degree", [None, 2])
+@pytest.mark.parametrize("model", ["pinhole", "fisheye", "ortho"])
+def test_all_cameras_and_tiny_gaussians_are_those_of_plain_compositing(model, degree):
+    """Antialiased, without a floor; SH are seen from the camera's centre. A fourth channel changes no other."""
+    given = Inputs(3, degree=degree, count=300)
+    with torch.no_grad():
+        given.scales[::2] *= 0.02
+        given.Ks[:, :2, :2] /= 4 if model == "ortho" else 1
+    options = {"camera_model": model, "rasterize_mode": "antialiased"}
+    expected = composited(given, "RGB+D", described(given, True, 0.3, model))
+    found = given.draw(render_mode="RGB+D", **options)[:2]
+    both = [given.gradients(*images) for images in (found, expected)]
+    pairs = dict(zip(("image", "alpha"), zip(found, expected, strict=True), strict=True))
+    for name, (got, wanted) in (pairs | {n: (both[0][n], both[1][n]) for n in NAMES}).items():
+        if name == "views":
+            got, wanted = got[:, :3], wanted[:, :3]
+        assert (got - wanted).abs().max() < 1e-9 * wanted.abs().max(), name
+    given.colors = torch.cat([given.colors, given.colors[..., :1]], -1)
+    given.backgrounds = torch.nn.functional.pad(given.backgrounds, (0, 1))
+    assert torch.allclose(given.draw(**options)[0][..., :3], found[0][..., :3], atol=1e-9)
 
 
 @pytest.mark.parametrize(("packed", "cameras"), [(False, 1), (True, 1), (False, 2), (True, 2)])
@@ -188,6 +222,32 @@ def test_float32_agrees_with_float64(packed, device):
         for wanted, got in zip(*found, strict=True):
             assert wanted.shape == got.shape
             assert (got.cpu().double() - wanted).abs().max() <= 1e-4 * wanted.abs().max(), (channels, degree)
+
+
+def zero_unnoticed(gradient: Tensor) -> None:
+    """In place without a new version, as by numpy."""
+    gradient.data.zero_()
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize(("packed", "cameras"), [(False, 1), (True, 1), (False, 2), (True, 2)])
+@pytest.mark.parametrize("change", [lambda gradient: 0 * gradient, Tensor.zero_, zero_unnoticed])
+def test_gradients_that_hooks_zero_leave_nothing(change, packed, cameras, device):
+    """Not even a rounding error, of which Adam would make a whole step; other gradients stay."""
+    found = []
+    for hooked in ((), ("means2d", "conics", "opacities")):
+        given = Inputs(8)
+        for name in (*NAMES, "Ks", "backgrounds"):
+            value = getattr(given, name)[:cameras] if name in ("views", "Ks", "backgrounds") else getattr(given, name)
+            setattr(given, name, value.detach().float().to(device).requires_grad_(name in NAMES))
+        image, _, notes = given.draw(packed=packed)
+        for name in hooked:
+            notes[name].register_hook(change)
+        del notes
+        image.square().sum().backward()
+        found.append({name: getattr(given, name).grad for name in NAMES})
+    assert torch.equal(*(one.pop("colors") for one in found))
+    assert all(t.any() for t in found[0].values()) and not any(t.any() for t in found[1].values())
 
 
 def test_a_hook_of_one_pass_changes_no_other():
@@ -361,13 +421,28 @@ def test_what_has_a_tile_is_shown(opacity):
     assert torch.equal(*gradients) and (gradients[0].any() or opacity < 1)
 
 
-def test_a_colour_that_is_not_finite_spoils_no_other_gradient():
-    given = Inputs(5, degree=2)
+@CPU_AND_GPU
+def test_a_colour_that_is_not_finite_spoils_no_other_gradient(device):
+    """Of a Gaussian in the image, and of one without a tile, whose colour nothing reads on a GPU."""
+    given = Inputs(5, degree=2, count=4000)
     with torch.no_grad():
-        given.colors[0] = math.nan
+        given.scales *= 0.1
+        given.opacities *= torch.linspace(0, 0.05, 4000, dtype=DOUBLE)
+        given.opacities[0] = 1.0
+    for name in (*NAMES, "Ks", "backgrounds"):
+        setattr(given, name, getattr(given, name).detach().float().to(device).requires_grad_(name in NAMES))
+    meta = given.draw(packed=False)[2]
+    bad = ((meta["radii"] > 0).all(-1) & (meta["tiles_per_gauss"] == 0)).any(0) & (meta["tiles_per_gauss"] == 0).all(0)
+    assert bad.any() and meta["radii"][:, 0].any()
+    bad[0] = True
+    with torch.no_grad():
+        given.colors[bad] = math.nan
     image, _, meta = given.draw(packed=False)
     (image.sum() + meta["means2d"].sum() + meta["depths"].sum()).backward()
-    assert not meta["radii"][:, 0].any() and given.means.grad[1:].isfinite().all() and given.means.grad[1:].any()
+    assert not meta["radii"][:, 0].any()
+    for name in ("means", "scales", "views"):
+        gradient = getattr(given, name).grad
+        assert gradient.isfinite().all() and gradient.any(), name
 
 
 def test_sparse_gradients_have_the_rows_that_are_shown():
@@ -512,8 +587,18 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ({"render_mode": "RGB-Ed"}, r"render_mode 'RGB-Ed' needs with_eval3d, .*; take 'RGB\+ED'"),
         (
             {"sh_degree": 2, "colors": torch.zeros(60, 4, 3, dtype=DOUBLE)},
-            "colors of degree 2 must have 9 bands, got 4",
+            r"colors of degree 2 must be \(..., 60, 9 or more, D\), got \(60, 4, 3\)",
         ),
+        ({"sh_degree": 3}, r"colors of degree 3 must be \(..., 60, 16 or more, D\), got \(60, 3\)"),
+        (
+            {"extra_signals_sh_degree": 1, "extra_signals": torch.zeros(CAMERAS, 60, 5, dtype=DOUBLE)},
+            r"extra_signals of degree 1 must be \(..., 60, 4 or more, D\), got \(2, 60, 5\)",
+        ),
+        (
+            {"sh_degree": 1, "colors": torch.zeros(3, 60, 4, 3, dtype=DOUBLE)},
+            r"colors must be \(60, 4, 3\), got \(3, 60, 4, 3\)",
+        ),
+        ({"colors": torch.zeros(60, 16, 3, dtype=DOUBLE)}, r"colors must be \(..., 60, D\), got \(60, 16, 3\)"),
         ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),
         ({"viewmats": torch.eye(4, dtype=DOUBLE)}, r"viewmats must be \(1, 4, 4\), got \(4, 4\)"),
         (
@@ -527,7 +612,7 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ({"tile_size": 0}, "tile_size must be a whole number of 1 or more, got 0"),
         ({"sh_degree": 2.0}, "sh_degree must be a whole number of 0 or more, got 2.0"),
         ({"means": torch.zeros(3)}, r"means must be \(..., N, 3\), got \(3,\)"),
-        ({"colors": None}, r"colors must be \(..., N, D\), got None"),
+        ({"colors": None}, r"colors must be \(..., 60, D\), got None"),
         ({"backgrounds": torch.zeros(3, dtype=DOUBLE), "packed": False}, r"backgrounds must be \(2, 3\), got \(3,\)"),
     ],
 )

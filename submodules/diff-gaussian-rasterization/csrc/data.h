@@ -36,11 +36,12 @@ template <class T>
 struct Dilation {
   T area;       // px^2, at most 1
   T exponents;  // area over kHalfLog2e
+  T floor;      // of det / det dilated, whose root is the antialiasing factor
 };
-constexpr double kUsualNear = 0.2, kUsualDilation = 0.3;
+constexpr double kUsualNear = 0.2, kUsualDilation = 0.3, kUsualFloor = 2.5e-5;  // the factor is at least 0.005
 template <class T>
-constexpr Dilation<T> dilation_of(double area) {
-  return {T(area), T(area / (0.5 / 0.693147180559945309417))};
+constexpr Dilation<T> dilation_of(double area, double floor = kUsualFloor) {
+  return {T(area), T(area / (0.5 / 0.693147180559945309417)), T(floor)};
 }
 
 // How pixels see Gaussians: by EWA, or on their rays (math/ray.h), those of a pinhole or of a lens (math/lens_rays.h).

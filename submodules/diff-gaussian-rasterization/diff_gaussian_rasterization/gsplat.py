@@ -8,7 +8,7 @@ Names, order, defaults, shapes and results are gsplat's; what it does not have i
 
 import contextlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -165,9 +165,10 @@ def _together(parts: Sequence[Tensor], form: tuple[int, ...]) -> Tensor:
 
 def _project(call: Call, item: Item) -> _Projection:
     view, near = item.view, call.near
-    if call.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding
-        view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
     camera = OPERATORS.pinhole(view.detach(), item.K, *call.size)
+    if call.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding, but for its centre
+        view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
+        camera = *OPERATORS.pinhole(view.detach(), item.K, *call.size)[:2], camera[2]
     lens = _lens(call, item.K)
     opacities, depth = item.opacities, _depth(call, item)
     if call.model != "pinhole" or call.far < _ENDLESS:  # the kernels know the near plane of a pinhole alone
@@ -184,9 +185,9 @@ def _project(call: Call, item: Item) -> _Projection:
     scene = (
         item.means, opacities, item.scales, item.quats, item.covars,
         item.means.detach() if degree is None else None,  # projection asks for colours; nothing shows these
-        *harmonics, *camera, (*lens, call.eps2d, near), (*call.size, degree or 0, call.antialiased, 2),
+        *harmonics, *camera, (*lens, call.eps2d, near), (*call.size, degree or 0, 2 * call.antialiased, 2),
     )  # fmt: skip
-    numbers = _numbers(view, bool(degree), len(lens) > 3) if needs_function(view) else None
+    numbers = _numbers(view, item.view if degree else None, len(lens) > 3) if needs_function(view) else None
     shared = Shared()
     train = needs_function(*item)
     how = shared, train if depth is None else None, numbers, None
@@ -213,10 +214,13 @@ def _lens(call: Call, K: Tensor) -> tuple[float, ...]:
     return 0.0, 0.0, 1.0, *lens.numbers(width, height)
 
 
-def _numbers(view: Tensor, centered: bool, lens: bool) -> Tensor:
-    """The camera's numbers (camera.py), of which only the gradients of the pose are read: 15, then zeros."""
+def _numbers(view: Tensor, seen_from: Tensor | None, lens: bool) -> Tensor:
+    """The camera's numbers (camera.py), of which only the gradients of the pose are read: 15, then zeros.
+
+    seen_from (4, 4): the pose whose centre colours depend on.
+    """
     view = view.double()
-    center = torch.linalg.inv_ex(view)[0][:3, 3] if centered else view.new_zeros(3)
+    center = view.new_zeros(3) if seen_from is None else _center(seen_from)
     return torch.cat([view[:3, :3].reshape(9), view[:3, 3], center, view.new_zeros(_NUMBERS[lens])])
 
 
@@ -231,8 +235,12 @@ def _shown(item: Item, values: Tensor, degree: int | None, least: float) -> Tens
     """Values (N, D), or what SH (N, K, D) are in the directions from the camera, at least `least`."""
     if degree is None:
         return values
-    center = torch.linalg.inv_ex(item.view.double())[0][:3, 3].to(item.means)
-    return (sh_values(degree, values, item.means - center) + 0.5).clamp_min(least)
+    return (sh_values(degree, values, item.means - _center(item.view).to(item.means)) + 0.5).clamp_min(least)
+
+
+def _center(view: Tensor) -> Tensor:
+    """The place of a camera (3,), float64, by its view (4, 4)."""
+    return torch.linalg.inv_ex(view.double())[0][:3, 3]
 
 
 @cache
@@ -302,6 +310,9 @@ def _meta(
         else:
             image = torch.cat([torch.full_like(own, n) for n, own in enumerate(rows)])
             ids = {"batch_ids": image // form[-1], "camera_ids": image % form[-1], "gaussian_ids": torch.cat(rows)}
+    hooks = [_hooks_of(notes[n]) for n in (1, 3, 4) if notes[n].requires_grad]
+    for one in projections:
+        one.shared.hooks = hooks
     begin = 0
     for n, one in enumerate(projections) if call.absgrad else ():
         place = slice(begin, begin := begin + len(one.rows)) if call.packed else n
@@ -311,6 +322,13 @@ def _meta(
     sizes = {"width": width, "height": height, "tile_size": tile, "tile_width": tiles[1], "tile_height": tiles[0]}
     sizes |= {"n_batches": math.prod(form[:-1]), "n_cameras": form[-1]}
     return Meta(ids | dict(zip(names, notes, strict=True)) | sizes, form, lists, rows)
+
+
+def _hooks_of(values: Tensor) -> Callable[[], dict | None]:
+    """A weak reference to the hooks of values, which gets those that are registered later."""
+    handle = values.register_hook(torch.neg)
+    handle.remove()
+    return handle.hooks_dict_ref
 
 
 class _Lengths(NamedTuple):

@@ -159,12 +159,12 @@ def _check_shapes(call: Call, given: Item, form: tuple[int, ...]) -> None:
     ):
         if values is None and (name == "extra_signals" or not call.colored):
             continue
-        if values is None or values.dim() < 2:
-            raise ValueError(f"{name} must be (..., N, D), got {None if values is None else tuple(values.shape)}")
-        harmonic = degree is not None
-        shapes.append((name, values, ((), *both) if harmonic else both, (count, *values.shape[-1 - harmonic :])))
-        if harmonic and values.shape[-2] < (degree + 1) ** 2:
-            raise ValueError(f"{name} of degree {degree} must have {(degree + 1) ** 2} bands, got {values.shape[-2]}")
+        harmonic, bands = degree is not None, 0 if degree is None else (degree + 1) ** 2
+        found = None if values is None else tuple(values.shape)
+        if found is None or found[-2 - harmonic : -1 - harmonic] != (count,) or (harmonic and found[-2] < bands):
+            form, of = (f"{bands} or more, D", f" of degree {degree}") if harmonic else ("D", "")
+            raise ValueError(f"{name}{of} must be (..., {count}, {form}), got {found}")
+        shapes.append((name, values, ((), *both) if harmonic else both, (count, *found[-1 - harmonic :])))
     if given.background is not None:
         shapes.append(("backgrounds", given.background, each, given.background.shape[-1:]))
     for name, values, leads, tail in shapes:

@@ -1,8 +1,9 @@
 """An image of channels in three stages, each a function of autograd: projection, description, blending.
 
-Blending sends back to `splats` no gradient of their values but moments (csrc/math/footprint.h), from which projection
-makes gradients without loss. What it sends to the description is the same once more, as gradients of means, conics and
-opacities, so that hooks see them. Only what somebody adds to these is turned into moments on the way back.
+The gradient of `splats` is moments (csrc/math/footprint.h) in place of gradients of their values, from which projection
+makes gradients without loss. Where splats are described, blending sends the moments to the description, and beside them
+the same as gradients of means, conics and opacities, so that hooks see them. Gradients that come back changed are
+turned into moments.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,12 +35,13 @@ class Blending(NamedTuple):
 class Shared:
     """What an image's stages tell each other during a backward pass."""
 
-    __slots__ = ("lengths", "moments", "sent", "shown", "task", "use_lengths")
+    __slots__ = ("hooks", "lengths", "moments", "sent", "shown", "task", "use_lengths")
 
     def __init__(self) -> None:
         self.lengths: Tensor | None = None  # of absolute gradients, (N,)
         self.shown: Tensor | None = None  # (N,) int32: not 0 of rows that get gradients beside those of the image
         self.use_lengths: Callable[[Tensor], None] | None = None
+        self.hooks: list[Callable[[], dict | None]] = []  # those of the description, each None once it is gone
         self.task = self.moments = self.sent = None
 
     def send(self, moments: Tensor, gradients: Sequence[Tensor]) -> None:
@@ -85,6 +87,10 @@ class _Projected(Function):
         splats, tile_counts = saved[_TENSORS:]
         if ctx.shared.shown is not None:
             tile_counts, ctx.shared.shown = ctx.shared.shown, None
+            if splats.is_cuda and scene[6] is not None:  # whose kernels look at the SH of those with a tile alone
+                read = (scene[12][2] + 1) ** 2 - 1
+                sums = scene[6].sum((1, 2)) + scene[7][:, :read].sum((1, 2))
+                tile_counts = torch.where(sums.isfinite(), tile_counts, 0)
         source = splats, tile_counts, torch.zeros_like(splats) if moments is None else moments
         means, to_view = scene[0], scene[8].to(splats)[:3, 2]
         if needed[2]:
@@ -133,8 +139,9 @@ class _Described(Function):
     def backward(ctx: Any, _: Any, centers: Tensor, of_depth: Tensor, conics: Tensor, opacities: Tensor, *__) -> tuple:
         splats, tile_counts, rows, radii = ctx.saved_tensors
         moments, marks = ctx.shared.take()
-        given, added = [centers, conics, opacities], None
+        given = [centers, conics, opacities]
         same = [None if values is None else (values.data_ptr(), values._version) for values in given] == marks
+        same = same and not any(hooks() for hooks in ctx.shared.hooks)  # which may change values and no mark
         if not same or of_depth is not None:
             if rows is None:
                 shown = torch.maximum(tile_counts, radii[0].amin(-1))
@@ -142,13 +149,13 @@ class _Described(Function):
                 shown = tile_counts.index_fill(0, rows, 1)
             ctx.shared.shown = shown
         if not same:
-            sent = [0] * 3 if moments is None else _screen(splats, tile_counts, moments, rows)
-            more = [(0 if got is None else got) - own for got, own in zip(given, sent, strict=True)]
-            more = [_dense(part, rows, splats) if isinstance(part, Tensor) else part for part in more]
-            added = _moments(splats, shown, *more)
+            moments = torch.zeros_like(splats) if moments is None else moments
+            sent = OPERATORS.describe_vjp(splats, tile_counts, moments)
+            dense = [own if got is None else _dense(got, rows, splats) for got, own in zip(given, sent, strict=True)]
+            moments = _with_changes(moments, splats, shown, sent, dense)
         if of_depth is not None:
             of_depth = torch.where(shown > 0, _dense(of_depth, rows, splats), 0)
-        return None, None, None, added, of_depth, None
+        return None, None, None, moments, of_depth, None
 
 
 def _screen(splats: Tensor, tile_counts: Tensor, moments: Tensor, rows: Tensor | None) -> Sequence[Tensor]:
@@ -164,20 +171,19 @@ def _dense(packed: Tensor, rows: Tensor | None, splats: Tensor) -> Tensor:
     return packed.new_zeros(len(splats), *packed.shape[1:]).index_copy_(0, rows, packed)
 
 
-def _moments(splats: Tensor, shown: Tensor, centers: Tensor, conics: Tensor, opacities: Tensor) -> Tensor | None:
-    """The moments of which these are the gradients; the way back of the operator `describe_vjp`. 0: none is given."""
-    out = torch.zeros_like(splats)
+def _with_changes(
+    moments: Tensor, splats: Tensor, shown: Tensor, sent: Sequence[Tensor], given: Sequence[Tensor]
+) -> Tensor:
+    """Moments, but of what is given where that is not what was sent: gradients of means2d, conics and opacities."""
     l11, l12, l22 = splats[:, 2].abs(), splats[:, 3], splats[:, 4]
-    if isinstance(opacities, Tensor):
-        out[:, 0] = opacities * splats[:, 5].exp2()
-    if isinstance(centers, Tensor):
-        out[:, 1] = centers[:, 0] / (_TWO_LN2 * l11)
-        out[:, 2] = (centers[:, 1] / _TWO_LN2 - l12 * out[:, 1]) / l22
-    if isinstance(conics, Tensor):
-        xx, xy, yy = -2 * conics[:, 0], -conics[:, 1], -2 * conics[:, 2]
-        out[:, 3] = l11 * l11 * xx + 2 * l11 * l12 * xy + l12 * l12 * yy
-        out[:, 4], out[:, 5] = l22 * (l11 * xy + l12 * yy), l22 * l22 * yy
-    return torch.where((shown > 0)[:, None], out, 0)
+    centers, conics, opacities = given
+    u, xx, xy, yy = centers[:, 0] / (_TWO_LN2 * l11), -2 * conics[:, 0], -conics[:, 1], -2 * conics[:, 2]
+    mean = u, (centers[:, 1] / _TWO_LN2 - l12 * u) / l22
+    shape = l11 * l11 * xx + 2 * l11 * l12 * xy + l12 * l12 * yy, l22 * (l11 * xy + l12 * yy), l22 * l22 * yy
+    made = torch.stack([opacities * splats[:, 5].exp2(), *mean, *shape], 1)
+    moved, bent, dimmed = (got != own for got, own in zip(given, sent, strict=True))
+    differ = torch.stack([dimmed, *[moved.any(1)] * 2, *[bent.any(1)] * 3], 1) & (shown > 0)[:, None]
+    return torch.cat([torch.where(differ, made, moments[:, :6]), moments[:, 6:]], 1)
 
 
 class _Blended(Function):
@@ -228,7 +234,6 @@ class _Blended(Function):
         moments, lengths, of_values = OPERATORS.channel_moments(
             kept, values, of_image, of_alpha, how.cap, how.stops, how.absolute, needed[11] or needed[12], last
         )
-        results[7] = moments
         if how.absolute:
             shared.lengths = lengths
             if shared.use_lengths:
@@ -237,6 +242,8 @@ class _Blended(Function):
             screen = _screen(splats, tile_counts, moments, rows)
             shared.send(moments, screen)
             results[8:11] = screen
+        else:
+            results[7] = moments
         first, count = ctx.widths
         if needed[11]:
             results[11] = _packed(of_values[:, -1], rows)

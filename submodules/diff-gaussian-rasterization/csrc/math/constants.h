@@ -12,7 +12,6 @@ constexpr double kMinAlpha = 1.0 / 255;  // a smaller alpha is not blended
 constexpr double kLog2MinAlpha = -7.994353436858857938;  // log2 of the above
 constexpr double kMaxAlpha = 0.99;                       // the gradient passes this cap
 constexpr double kMinTransmittance = 1e-4;  // a splat that would leave less ends the pixel and is not blended
-constexpr double kMinAntialias = 2.5e-5;    // floor of det / det dilated: the compensation is at least 0.005
 constexpr double kRadiusSigmas = 3;         // for `radii` and visibility, not for which pixels are reached
 constexpr double kMinRadiusRoot = 0.1;      // px^4, under the root of the larger eigenvalue
 constexpr double kMaxLog2Opacity = 64;      // opacities are at most 1; this keeps exp2 finite for others

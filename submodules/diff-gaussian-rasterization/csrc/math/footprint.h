@@ -39,8 +39,8 @@ GS_HD Footprint<T> make_footprint(Vec3<T> m1, Vec3<T> m2, Vec3<T> minors, Dilati
   f.l11 = root(k / f.schur);
   f.l12 = -(f.b / f.c) * f.l11;
   const T ratio = det0 / f.schur;
-  f.floored = !(ratio > Scalar<T>(kMinAntialias));
-  f.compensation = root(f.floored ? all<T>(kMinAntialias) : ratio);
+  f.floored = !(ratio > dilation.floor);
+  f.compensation = root(f.floored ? all<T>(dilation.floor) : ratio);
   return f;
 }
 

@@ -65,7 +65,7 @@ SceneTensors::SceneTensors(const std::array<const Tensor*, kInputs - 1>& gaussia
   for (int k = 0; !plain && k < gs::kLensNumbers; ++k) lens_[k] = lens[3 + k];
   image_ = checked_image(options[0], options[1]);
   GS_CHECK_VALUE(options[2] >= 0 && options[2] <= kMaxShDegree, "sh_degree must be 0 to 3, got ", options[2]);
-  sh_degree_ = int(options[2]), antialiasing_ = options[3];
+  sh_degree_ = int(options[2]), antialiasing_ = int(options[3]);
   raw_ = options[4] == 1, any_rotation_ = options[4] != 0, keeps_shapes_ = options[4] == 2;
   rays_ = options.size() > 5 && options[5];
   const auto has = [&](Input input) { return gaussians[input - 1] != nullptr; };

@@ -9,8 +9,8 @@
 
 // The Gaussians, of which some may be null; the view matrix and the full projection, both transposed, and the centre;
 // tan_x, tan_y and scale_modifier, perhaps the numbers of a gs::Lens, and perhaps dilation and near; height, width,
-// sh_degree, antialiasing, raw (2: rotations alone have any length, and shapes are kept), and perhaps whether Gaussians
-// are seen on rays.
+// sh_degree, antialiasing (2: without a floor), raw (2: rotations alone have any length, and shapes are kept), and
+// perhaps whether Gaussians are seen on rays.
 #define CAMERA_SCHEMA "float[] lens, int[] options"
 #define SCENE_SCHEMA                                                                                   \
   "Tensor means, Tensor opacities, Tensor? scales, Tensor? rotations, Tensor? cov3d, Tensor? colors, " \
@@ -118,7 +118,7 @@ class SceneTensors {
             int(rest_bands()),
             sh_degree_,
             raw_,
-            antialiasing_,
+            antialiasing_ != 0,
             T(scale_modifier_),
             pointer(view_),
             pointer(projection_),
@@ -131,7 +131,7 @@ class SceneTensors {
             blocks_.defined() ? blocks_.size(0) : 0,
             lens_from<T>(lens_.data()),
             rays_,
-            gs::dilation_of<T>(dilation_),
+            gs::dilation_of<T>(dilation_, antialiasing_ == 2 ? 0 : gs::kUsualFloor),
             T(near_),
             any_rotation_,
             keeps_shapes_};
@@ -147,8 +147,8 @@ class SceneTensors {
   Tensor view_, projection_, center_, awake_, blocks_;
   double tan_x_, tan_y_, scale_modifier_, dilation_ = gs::kUsualDilation, near_ = gs::kUsualNear;
   std::array<double, gs::kLensNumbers> lens_ = {};  // gs::Lens; a pinhole if it is not given
-  int sh_degree_;
-  bool antialiasing_, raw_, any_rotation_, keeps_shapes_, rays_;
+  int sh_degree_, antialiasing_;
+  bool raw_, any_rotation_, keeps_shapes_, rays_;
   gs::Image image_;
 };
 
