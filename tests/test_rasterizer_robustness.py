@@ -7,10 +7,12 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import CPU_AND_GPU, activated, gradients, pick, render
+from diff_gaussian_rasterization.channels import rasterize_channels
+from diff_gaussian_rasterization.lens import Lens
+from rasterizer_tools import CPU_AND_GPU, PLANES, activated, gradients, leaves, pick, render
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import KINDS, ordinary, settings
+from benchmarks.workloads.splat_scenes import KINDS, on_device, ordinary, settings
 
 N, VICTIM, SIZE = 40, 17, (75, 53)
 NOT_FINITE = [math.nan, math.inf, -math.inf]
@@ -70,6 +72,64 @@ def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, cam
                         key,
                         value,
                     )
+
+
+def planes_of(inputs: dict[str, Tensor], camera, channels: int, means2d: Tensor) -> list[Tensor]:
+    """What a camera shows: a colour, an inverse depth and a transmittance, or so many channels."""
+    if not channels:
+        out = render(inputs, camera, means2d, want_absolute_gradient=True)
+        return [getattr(out, plane) for plane in PLANES]
+    rest = {name: t for name, t in inputs.items() if not name.startswith("sh")}
+    rest |= {"features": inputs["sh_rest"].flatten(1)[:, :channels], "raw": True}
+    return list(
+        rasterize_channels(means2d=means2d, settings=camera._replace(bg=means2d.new_ones(channels)), **rest)[:2]
+    )
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize(
+    ("channels", "options"),
+    [
+        *((channels, {}) for channels in (0, 3, 4, 7, 40)),
+        *((channels, {"projection": "ray"}) for channels in (0, 7)),
+        (0, {"projection": "ray", "lens": Lens("equidistant", (60.0, 60.0), (37.0, 26.0))}),
+    ],
+)
+def test_what_is_not_finite_at_a_pixel_is_of_those_that_reach_it(channels, options, camera, device):
+    """Gradients of pixels, and channels of a Gaussian: elsewhere all has the bits of what is finite."""
+    camera = on_device(camera._replace(**options), device)
+
+    def results(value: float, pixels: Tensor, gradient: float, others: float) -> tuple[list[Tensor], dict[str, Tensor]]:
+        """Planes and gradients. value: the victim's. gradient, others: of the pixels, and a factor of others'."""
+        inputs = leaves({name: t.to(device) for name, t in scene(True).items()})
+        if channels:
+            inputs["sh_rest"].data[VICTIM] = value
+        means2d = torch.zeros_like(inputs["means"], requires_grad=True)
+        planes = planes_of(inputs, camera, channels, means2d)
+        draw = torch.Generator().manual_seed(3)
+        weights = [others * torch.randn(t.shape, generator=draw).to(t) for t in planes]
+        torch.autograd.backward(planes, [torch.where(pixels, gradient, w) for w in weights])
+        return planes, {name: t.grad for name, t in [*inputs.items(), ("means2d", means2d)] if t.grad is not None}
+
+    no_pixel = torch.zeros(SIZE[::-1], dtype=torch.bool, device=device)
+    pixel = no_pixel.clone()
+    pixel[26, 37] = True
+    reach = results(0.5, pixel, 1.0, 0.0)[1]["opacities"].flatten() != 0
+    wanted = results(0.5, pixel, 0.0, 1.0)[1]
+    assert 0 < reach.sum() < N
+    for value in (math.nan, math.inf):
+        for name, gradient in results(0.5, pixel, value, 1.0)[1].items():
+            assert torch.equal(gradient[~reach], wanted[name][~reach]), name
+            assert not gradient[reach].isfinite().all(), name
+    if not channels:
+        return
+    planes, wanted = results(0.0, no_pixel, 0.0, 1.0)
+    seen = (planes[0] != results(1e3, no_pixel, 0.0, 1.0)[0][0]).any(0)
+    shown, found = results(math.nan, no_pixel, 0.0, 1.0)
+    assert seen.any() and not seen.all() and torch.equal(shown[0].isnan().all(0), seen)
+    assert torch.equal(shown[0][:, ~seen], planes[0][:, ~seen]) and torch.equal(shown[1], planes[1])
+    apart = results(0.0, seen, math.nan, 1.0)[1]["opacities"].flatten().isfinite()
+    assert apart.any() and all(torch.equal(found[name][apart], wanted[name][apart]) for name in found)
 
 
 @CPU_AND_GPU

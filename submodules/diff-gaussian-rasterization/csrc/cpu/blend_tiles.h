@@ -137,8 +137,10 @@ bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& st
     for (int c = 0; c < kWidth<kPayload>; ++c) sums[c] += weight * chunk.payload[c][k];
     if constexpr (kPayload == kChannels) further.weigh(position + k, weight);
   });
-  for (int c = 0; c < kWidth<kPayload>; ++c) S::store(state.payload[c] + at, sums[c]);
-  if constexpr (kPayload == kChannels) further.add(at);
+  if constexpr (kPayload == kChannels)
+    further.store(0, sums, state.payload[0] + at), further.add(at);
+  else
+    for (int c = 0; c < kWidth<kPayload>; ++c) S::store(state.payload[c] + at, sums[c]);
   return open;
 }
 

@@ -39,6 +39,16 @@ class FurtherPlanes<T, kChannels> {
     weights_[count_] = weight, rows_[count_++] = channels_.of(instances_[position]);
   }
 
+  // Stores the strip's sums of channels. A value that is not finite takes no part where its splat does not reach; to
+  // test every weight for that would cost a tenth.
+  template <int kCount>
+  void store(int64_t first, const V (&sums)[kCount], T* to) const {
+    V none = {};
+    for (int c = 0; c < kCount; ++c) none += 0 * sums[c];
+    if (S::any(none != none)) return add_reached(first, std::min(first + kCount, channels_.count), to);
+    for (int c = 0; c < kCount; ++c) S::store(to + c * kPixels, sums[c]);
+  }
+
   // Adds what was weighed to the strip, whose pixels begin at `at`.
   void add(int at) {
     int64_t c = kLeading;
@@ -54,7 +64,15 @@ class FurtherPlanes<T, kChannels> {
     for (int c = 0; c < kCount; ++c) sums[c] = S::load(to + c * kPixels);
     for (int i = 0; i < count_; ++i)
       for (int c = 0; c < kCount; ++c) sums[c] += weights_[i] * rows_[i][first + c];
-    for (int c = 0; c < kCount; ++c) S::store(to + c * kPixels, sums[c]);
+    store(first, sums, to);
+  }
+
+  __attribute__((noinline)) void add_reached(int64_t first, int64_t end, T* to) const {
+    for (int64_t c = first; c < end; ++c, to += kPixels) {
+      V sum = S::load(to);
+      for (int i = 0; i < count_; ++i) sum = weights_[i] > 0 ? sum + weights_[i] * rows_[i][c] : sum;
+      S::store(to, sum);
+    }
   }
 
   const Channels<T>& channels_;
@@ -101,14 +119,15 @@ class FurtherSums<T, kChannels> {
   V slope(V q, V uncapped) const { return uncapped > end_ ? V{} : q; }
   void weigh(int at, V weight) { reached_[count_++] = {weight, at}; }
 
-  // Puts the splat's sums into its row, which is number `number`, and into that of its channels.
+  // Puts the splat's sums into its row, which is number `number`, and into that of its channels. finite:
+  // BackwardState's.
   template <int kRow>
-  void store(T (&sums)[kRow], const PassRows<T>& pass, int64_t number, T* row) const {
+  void store(T (&sums)[kRow], const PassRows<T>& pass, int64_t number, T* row, bool finite) const {
     constexpr int kFirst = kGradientValues - kLeading;  // of the channels
     if (pass.channels) {
       T* to = pass.channels + kMostChannels * number;
       std::copy_n(sums + kFirst, kLeading, to);
-      for (int64_t c = kLeading; c < channels_.count; c += kGroup) store_group(c, to);
+      for (int64_t c = kLeading; c < channels_.count; c += kGroup) store_group(c, to, finite);
     }
     sums[kGradientValues - 1] = 0;  // a channel is no inverse depth
     for (int v = 0; v < kRow; ++v) {
@@ -124,11 +143,16 @@ class FurtherSums<T, kChannels> {
     int at;
   };
 
-  void store_group(int64_t first, T* to) const {  // planes beyond the last one are zero
+  void store_group(int64_t first, T* to, bool finite) const {  // planes beyond the last one are zero
     V sums[kGroup] = {};
-    for (int i = 0; i < count_; ++i)
-      for (int c = 0; c < kGroup; ++c)
-        sums[c] += reached_[i].weight * S::load(planes_[first - kLeading + c] + reached_[i].at);
+    const auto gradient = [&](int i, int c) { return S::load(planes_[first - kLeading + c] + reached_[i].at); };
+    if (finite)
+      for (int i = 0; i < count_; ++i)
+        for (int c = 0; c < kGroup; ++c) sums[c] += reached_[i].weight * gradient(i, c);
+    else
+      for (int i = 0; i < count_; ++i)
+        for (int c = 0; c < kGroup; ++c)
+          sums[c] += reached_[i].weight * (reached_[i].weight > 0 ? gradient(i, c) : V{});
     T group[kGroup];
     LaneSums<T, int(sizeof sums[0])>::store(sums, group);
     std::copy_n(group, std::min<int64_t>(kGroup, kMostChannels - first), to + first);

@@ -157,7 +157,7 @@ __device__ __forceinline__ void splat_gradient(const BlendInput<float>& in, cons
     if (!(t >= kLeast) || first + k >= pixels.last[p]) continue;
     any = true;
     const float uncapped = exp2_device(t), alpha = capped<float, float>(uncapped, P::cap(in));
-    float q = uncapped * alpha_gradient<float, float>(alpha, value_of(p), transmittance[p], behind[p]);
+    float q = uncapped * alpha_gradient<float, float>(true, alpha, value_of(p), transmittance[p], behind[p]);
     if (P::kChannels && in.channels.stops && uncapped > alpha) q = 0;
     weight[p] = alpha * transmittance[p];
     add_pixel(moments, row, here, q);
@@ -174,7 +174,8 @@ __device__ __forceinline__ void splat_gradient(const BlendInput<float>& in, cons
 #pragma unroll
     for (int c = 0; c < 4; ++c)
 #pragma unroll
-      for (int p = 0; p < kRun; ++p) payload[c] += weight[p] * pixels.gradient[p][c];
+      for (int p = 0; p < kRun; ++p)
+        if (weight[p] > 0) payload[c] += weight[p] * pixels.gradient[p][c];  // which may not be finite elsewhere
   sum_row<kAbsolute, kRays>(moments, row, splat, payload, absolute_u, absolute_uv, sums);
   if constexpr (kFurther<P> > 0) {
     constexpr int kGroup = kFurther<P> > 16 ? kFurther<P> / 2 : kFurther<P>;  // a lane's registers hold no more sums
@@ -184,7 +185,8 @@ __device__ __forceinline__ void splat_gradient(const BlendInput<float>& in, cons
 #pragma unroll
       for (int i = 0; i < kGroup; ++i)
 #pragma unroll
-        for (int p = 0; p < kRun; ++p) group[i] += weight[p] * pixels.gradient[p][4 + c + i];
+        for (int p = 0; p < kRun; ++p)
+          if (weight[p] > 0) group[i] += weight[p] * pixels.gradient[p][4 + c + i];
       warp_sums(group, sums + kRow<kRays, kAbsolute> + c);
     }
   }

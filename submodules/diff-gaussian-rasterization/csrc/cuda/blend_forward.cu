@@ -58,7 +58,8 @@ struct Picture {
     for (int four = 0; four < kWidth / 4; ++four) {
       const float4 values = batch.four(k, four);
 #pragma unroll
-      for (int p = 0; p < kRun; ++p) add(p, weight[p], four, values);
+      for (int p = 0; p < kRun; ++p)
+        if (weight[p] > 0) add(p, weight[p], four, values);  // elsewhere a value that is not finite does not show
     }
   }
 

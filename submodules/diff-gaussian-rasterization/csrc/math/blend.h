@@ -89,10 +89,11 @@ GS_HD V quotient(V a, V b) {
 // dLoss/dalpha, walking back to front with one scalar for the colour: s = colour . image gradient of this splat, and
 // `behind` the normalised value of everything behind it. dLoss/dalpha = T (s - behind), T the transmittance in front of
 // the splat. transmittance holds T (1 - alpha) on entry and T on return. Nothing is subtracted from a stored colour.
+// Lanes that are not reached have an alpha of 0, and take no part even where s or `behind` is not finite.
 template <class T, class V>
-GS_HD V alpha_gradient(V alpha, V s, V& transmittance, V& behind) {
+GS_HD V alpha_gradient(Truth<V> reached, V alpha, V s, V& transmittance, V& behind) {
   transmittance = quotient(transmittance, T(1) - alpha);
-  const V difference = s - behind;
+  const V difference = reached ? s - behind : V{};
   behind = behind + alpha * difference;
   return transmittance * difference;
 }
