@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import train
 from gaussian_renderer.scored_views import mean_scores
+from splatting.evaluation import curve_recorder
 from splatting.evaluation.curve_recorder import (
     CurveDrawer,
     CurveRecorder,
@@ -281,8 +283,9 @@ class TestDrawer:
         drawer.draw()
         assert drawer.finish().startswith(f"UserError: cannot write {folder.resolve() / 'error_vs_time.png'} (")
 
-        started, popen = [], subprocess.Popen
-        monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: started.append(popen(*a, **k)) or started[-1])
+        started = []
+        begin = {"Popen": lambda *a, **k: started.append(subprocess.Popen(*a, **k)) or started[-1]}
+        monkeypatch.setattr(curve_recorder, "subprocess", SimpleNamespace(**vars(subprocess) | begin))
         drawer = CurveDrawer(folder, VIEWS)
         drawer.begin()
         started[0].kill()

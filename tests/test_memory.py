@@ -52,7 +52,7 @@ def test_a_disk_without_space_is_told_before_the_training(colmap_scene, tmp_path
     words = ["-s", str(colmap_scene), "-m", str(tmp_path / "out"), "-r", "48", "--disable_viewer", "--iterations", "3"]
     words += ["--save_iterations", "2", "--test_iterations", "-1"]
     free = Mock(return_value=Mock(free=50_000))
-    monkeypatch.setattr(resources.shutil, "disk_usage", free)
+    monkeypatch.setattr(resources, "shutil", Mock(disk_usage=free))
     said = "the disk of .*out has 0.1 MB free, and a model of 300 Gaussians takes 0.1 MB; free space there, or name"
     with pytest.raises(UserError, match=said):
         train.main(words)

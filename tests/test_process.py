@@ -1,5 +1,6 @@
 """train.py's process: what it imports and begins early, the seconds that it notes, its clock and its threads."""
 
+import gc
 import json
 import os
 import signal
@@ -12,11 +13,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from waiting import wait_for
 
 import train
 from scene import Scene
 from scene.gaussians.adam import undecorated
-from splatting.host import machine, start
+from splatting.evaluation.training_log import Stopwatch
+from splatting.host import clock, machine, start
 
 ROOT = Path(__file__).parents[1]
 UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "matplotlib")
@@ -162,7 +165,9 @@ def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
 # Prints the seconds of some work: by the clock, and by the wall.
 CLOCK = """
 import sys, time
-from splatting.host.clock import running_seconds
+from splatting.host.clock import running_seconds, tick
+user = lambda: None
+tick(user)
 WORK = {"hold the lock": lambda: sum(range(2 * 10**8)), "read": input}
 began, at = running_seconds(), time.monotonic()
 print("ready", flush=True)
@@ -189,6 +194,19 @@ def _counted(work: str, stopped: float = 0.0) -> tuple[float, float]:
 def test_seconds_of_a_stopped_process_do_not_count():
     counted, wall = _counted("read", stopped=3.0)
     assert wall > 3.0 and counted < wall - 2.5
+
+
+def test_the_thread_of_the_clock_ends_with_its_last_user():
+    def is_there() -> bool:
+        return any(thread.name == "ticks" for thread in threading.enumerate())
+
+    wait_for(lambda: gc.collect() or not is_there())  # of tests before
+    watches = [Stopwatch(), Stopwatch()]
+    watches.pop()
+    time.sleep(2 * clock._TICK)
+    assert is_there()
+    watches.pop()
+    wait_for(lambda: not is_there())
 
 
 @pytest.mark.slow

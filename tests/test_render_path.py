@@ -18,9 +18,8 @@ from PIL import Image
 from scene.cameras import camera_to_JSON
 from scene.dataset_readers import read_scene
 from scene.with_splats import model_of
-from splatting.camera_paths import from_above, render_path
+from splatting.camera_paths import from_above, render_path, video
 from splatting.camera_paths.keyframes import CameraPath, Keyframe
-from splatting.camera_paths.video import write_video
 from splatting.camera_paths.without_scene import WithoutScene, circle
 from splatting.viewer.untrained import _spheres
 from utils.system_utils import UserError
@@ -225,15 +224,15 @@ def test_an_ffmpeg_that_dies_is_quoted_and_no_file_stays(run, out, tmp_path, mon
 
 def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
     started: list[subprocess.Popen] = []
-    popen = subprocess.Popen
-    monkeypatch.setattr(subprocess, "Popen", lambda *a, **k: (started.append(popen(*a, **k)), started[0])[1])
+    begin = {"Popen": lambda *a, **k: started.append(subprocess.Popen(*a, **k)) or started[-1]}
+    monkeypatch.setattr(video, "subprocess", SimpleNamespace(**vars(subprocess) | begin))
 
     def frames() -> Iterator[np.ndarray]:
         yield from patches(3)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
+        video.write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
     assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
 
 

@@ -4,6 +4,7 @@ import contextlib
 import sqlite3
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -30,7 +31,9 @@ def test_a_database_opens_once_its_reader_is_done(tmp_path, monkeypatch):
     with pytest.raises(RuntimeError):
         pycolmap.Database.open(path)
     pauses = []
-    monkeypatch.setattr(database.time, "sleep", lambda seconds: pauses.append(seconds) or process.communicate())
+    # Not `time.sleep` itself, which threads of other modules call.
+    clock = SimpleNamespace(sleep=lambda seconds: pauses.append(seconds) or process.communicate())
+    monkeypatch.setattr(database, "time", clock)
     opened = database.opened(path)
     assert opened.num_images() == 0 and len(pauses) == 1
     opened.close()

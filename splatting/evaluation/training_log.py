@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from splatting.files.json_files import read_json, write_json
-from splatting.host.clock import running_seconds, wall_seconds
+from splatting.host.clock import running_seconds, tick, wall_seconds
 from splatting.host.memory import peak_memory_mib
 from utils.system_utils import UserError, compute_device
 
@@ -32,6 +32,7 @@ class Stopwatch:
         self._counter = counter or (lambda: math.nan)
         self._joules = self._counter()  # at the start, later without those of pauses
         self._joules_stopped = math.nan
+        tick(self)
         self._start = running_seconds()
         self._stopped: float | None = None  # when the outermost pause began
         self.spent: dict[str, float] = {}

@@ -6,6 +6,7 @@ A process is stopped by Ctrl-Z, or on a machine that sleeps.
 import os
 import threading
 import time
+import weakref
 from pathlib import Path
 
 _IMPORTED = time.perf_counter()
@@ -34,10 +35,13 @@ def wall_seconds() -> float:
     return time.perf_counter() - _IMPORTED if known is None else known
 
 
-class _Running(threading.Thread):
+class _Running:
+    """Counts seconds in which the process was not stopped. A thread looks at the clock while a user lives."""
+
     def __init__(self) -> None:
-        super().__init__(name="ticks", daemon=True)
         self._lock = threading.Lock()
+        self._users: weakref.WeakSet = weakref.WeakSet()
+        self._thread: threading.Thread | None = None
         self._seconds, self._before, self._worked = 0.0, time.monotonic(), _worked()
 
     def seconds(self) -> float:
@@ -49,10 +53,20 @@ class _Running(threading.Thread):
             self._before, self._worked = now, worked
             return self._seconds
 
-    def run(self) -> None:
-        while True:
+    def tick_for(self, user: object) -> None:
+        with self._lock:
+            self._users.add(user)
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._tick, name="ticks", daemon=True)
+                self._thread.start()
+
+    def _tick(self) -> None:
+        while self._thread:
             time.sleep(_TICK)
             self.seconds()
+            with self._lock:
+                if not self._users:
+                    self._thread = None
 
 
 def _worked() -> float:
@@ -63,16 +77,25 @@ def _worked() -> float:
         return time.process_time()
 
 
-_clock: _Running | None = None
+_clock = _Running()
+
+
+def _begin_anew() -> None:
+    global _clock
+    _clock = _Running()
+
+
+os.register_at_fork(after_in_child=_begin_anew)  # there, no other thread looks at the clock or gives back its lock
 
 
 def running_seconds() -> float:
-    """Seconds in which this process was not stopped. Only differences have a meaning; the first call starts a thread.
+    """Seconds in which this process was not stopped. Only differences have a meaning, while one user lives (`tick`).
 
     Stops of less than 2 seconds count as running.
     """
-    global _clock
-    if _clock is None or not _clock.is_alive():  # in a process that was forked it is not
-        _clock = _Running()
-        _clock.start()
     return _clock.seconds()
+
+
+def tick(user: object) -> None:
+    """Let a thread look at the clock while `user` lives: without it, a process that waits seems to be stopped."""
+    _clock.tick_for(user)
