@@ -82,6 +82,8 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
                     at.stopping = barrier.stopping  # read once: a signal may come at any moment
                     if at.stopping:
                         faster.drain()
+                    if at.rests:
+                        run.gaussians.drop_gradients()  # the earlier run, which ended here, left none to the next one
                     tell.stepped(at)  # checkpoints, viewers
                     if at.stopping:
                         raise at.stopping

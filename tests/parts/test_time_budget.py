@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from gaussians import options
-from trainings import before_steps, train_on
+from trainings import LEARNT, PART_OPTIONS, before_steps, narrow_scene, train_on
 
 from scene.gaussians import density_rules as rules
 from splatting.evaluation.training_log import Stopwatch
@@ -28,6 +28,8 @@ from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
            "--densification_interval", 5, "--max_num_splats", 400, "--iterations", 3000]  # fmt: skip
+CONTINUED = {name: PART_OPTIONS[name] for name in ("exposure", "ppisp", "refine_poses", "robust_mask")}
+CONTINUED |= {"plain": ("--plain_step",), "mcmc": ("--strategy", "mcmc")}
 
 
 def _fresh(length: int, budget: float) -> TimeBudget:
@@ -461,6 +463,22 @@ def test_a_finished_training_gets_more_seconds_and_its_schedule_repeats_all(
                out / f"chkpnt{third}.pth")  # fmt: skip
     assert read_schedule(tmp_path / "b" / "schedule.json") == read_schedule(out / "schedule.json")
     assert [one.after for one in read_schedule(out / "schedule.json").continued] == [first, second]
+
+
+@pytest.mark.parametrize("more", CONTINUED.values(), ids=CONTINUED)
+def test_what_trains_beside_the_gaussians_is_repeated_where_a_training_was_continued(tmp_path, monkeypatch, more):
+    """The iteration in which it ended first takes no step, and leaves no gradient to the next one."""
+    scene = narrow_scene(tmp_path / "scene")
+    words = "--iterations", 300, "--antialiasing", "--densify_from_iter", 20, *more
+    with monkeypatch.context() as timed:
+        _timed(timed, lambda t: 0.1)
+        _train(scene, tmp_path / "out", *words, "--time_budget", 1)
+        saved = _train(scene, tmp_path / "out", *words, "--resume", "--time_budget", 1)
+    repeated = _train(scene, tmp_path / "again", *words, "--schedule", tmp_path / "out" / "schedule.json")
+    assert repeated[max(repeated)] == saved[max(repeated)]
+    for name in LEARNT:
+        one, other = (tmp_path / folder / name for folder in ("out", "again"))
+        assert one.exists() == other.exists() and (not one.exists() or one.read_bytes() == other.read_bytes())
 
 
 def test_a_steady_run_goes_on_from_a_checkpoint_of_a_budget_and_removes_the_schedule(
