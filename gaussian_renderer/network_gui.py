@@ -5,6 +5,7 @@ nobody is connected; a loop may set it to None to drop the viewer. The protocol 
 """
 
 import contextlib
+import errno
 import os
 import socket
 import sys
@@ -44,10 +45,11 @@ class _Viewer:
 _viewer = _Viewer()
 
 
-def init(wish_host: str, wish_port: int) -> None:
+def init(wish_host: str, wish_port: int, chosen: bool = True) -> None:
     """Listen at an address; port 0: any free one, which is printed. What cannot be had is one warning on stderr.
 
-    `host` and `port` become the wish, and `port` the one that was found.
+    `host` and `port` become the wish, and `port` the one that was found. chosen: whether somebody chose the address;
+    if not, nothing is said of a port that another program has, as the second of two trainings finds.
     """
     global host, port, listener
     close()
@@ -57,6 +59,8 @@ def init(wish_host: str, wish_port: int) -> None:
         listener = socket.create_server((host, port), family=family)
         listener.setblocking(False)
     except (OSError, OverflowError) as error:
+        if not chosen and getattr(error, "errno", None) == errno.EADDRINUSE:
+            return
         reason = str(getattr(error, "strerror", None) or error).partition(" (")[0]  # it would name the address again
         print(
             f"warning: cannot listen at {host}:{port} ({reason}), which concerns only the viewer of the reference "
@@ -79,9 +83,9 @@ def close() -> None:
 
 
 @contextlib.contextmanager
-def listening(wish_host: str, wish_port: int) -> Iterator[None]:
+def listening(wish_host: str, wish_port: int, chosen: bool = True) -> Iterator[None]:
     """Within it, listen at an address (`init`)."""
-    init(wish_host, wish_port)
+    init(wish_host, wish_port, chosen)
     try:
         yield
     finally:

@@ -87,7 +87,7 @@ def test_all_places_have_one_number(scenes, tmp_path, monkeypatch, capsys, name)
     numbers = {"metrics": scored, "curve": curve, "log": printed, "last line": last, "independent": independent}
     assert all(math.isfinite(number) and abs(number - independent) < NEAR for number in numbers.values()), numbers
     by_channel = json.loads((tmp_path / "train_log.json").read_text())[-1]["test_psnr"]
-    assert f"PSNR {by_channel}" in said
+    assert f"PSNR {by_channel:.3f} (" in said
 
 
 def _psnr(method: Path, name: str, own: int | None) -> float:

@@ -50,7 +50,9 @@ class RemoteViewer(Part):
 
         self._run, self._gui = run, network_gui
         if not run.launch.disable_viewer:
-            run.resources.enter_context(self._gui.listening(run.launch.ip, run.launch.port))
+            ip, port = self.options.launch[:2]
+            address = run.launch.ip, run.launch.port
+            run.resources.enter_context(self._gui.listening(*address, address != (ip.default, port.default)))
 
     def due(self, at: "Iteration") -> bool:
         if self._gui.conn is None:

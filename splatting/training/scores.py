@@ -101,9 +101,9 @@ def training_report(
                 events.image(name, camera, what, image)
 
         if means := _means(scored, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
-            line = f"[ITER {iteration}] Evaluating {name}: L1 {means['l1']}"
+            line = f"[ITER {iteration}] Evaluating {name}: L1 {means['l1']:.5f}"
             if "psnr" in means:
-                line += f" PSNR {means['psnr']} (mean of the channels'; {means.pop('whole'):.3f} as metrics.py)"
+                line += f" PSNR {means['psnr']:.3f} (mean of the channels'; {means.pop('whole'):.3f} as metrics.py)"
             tqdm.write(line, file=sys.stdout)
             for events in told:
                 events.scores(name, means)

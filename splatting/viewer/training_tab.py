@@ -164,7 +164,7 @@ class TrainingTab:
 
     def end(self, text: str) -> None:
         """Show that the training is over. text: what came of it."""
-        for button in self._buttons:
-            button.visible = False
+        for shown in (*self._buttons, self.speed, self.left):
+            shown.visible = False
         self.note.visible = self.note.visible and self.curve.visible
         self.state.content, self.state.visible, self.close.visible = text, True, True

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,8 @@ from arguments.launch import launch_options
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
-from splatting.part import Part
+from splatting.part import Options, Part
+from splatting.parts.remote_viewer import RemoteViewer
 
 ITERATIONS = 60
 OPTIONS = (), ("--train_test_exp", "--antialiasing", "-w", "--random_background", "--convert_SHs_python")
@@ -269,6 +271,16 @@ def test_an_address_that_cannot_be_had_is_one_warning(address, capfd):
     assert warning.endswith("(SIBR); give --disable_viewer to silence this, or --port 0 for any free port")
     network_gui.try_connect()
     assert network_gui.conn is None
+
+
+def test_a_second_training_says_nothing_of_a_port_that_nobody_chose(colmap_scene, tmp_path, monkeypatch, capfd):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        ip, given, switch = RemoteViewer.options.launch
+        for default, warnings in ((port, 0), (1, 1)):
+            monkeypatch.setattr(RemoteViewer, "options", Options(launch=(ip, replace(given, default=default), switch)))
+            train_on(colmap_scene, tmp_path / f"{warnings}", "--iterations", 1, "--port", port, "-r", 48)
+            assert capfd.readouterr().err.count("cannot listen at") == warnings
 
 
 def test_disable_viewer_opens_nothing_and_the_default_address_is_the_reference_s(colmap_scene, tmp_path, monkeypatch):

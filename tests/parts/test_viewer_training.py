@@ -160,6 +160,7 @@ def test_the_page_shows_how_the_training_goes(colmap_scene, tmp_path, monkeypatc
     tab = watched.observer._tab
     seconds, psnr = tab.curve.data
     assert (seconds[1:] >= seconds[:-1]).all() and tab.curve.visible and 5 < psnr.mean() < 60 and float(tab.loss.value)
+    assert not tab.left.visible and not tab.speed.visible  # it is over
 
 
 def test_a_pause_from_the_start_and_faults_of_the_page_change_no_byte(colmap_scene, tmp_path, monkeypatch, capfd):
