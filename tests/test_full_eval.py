@@ -337,9 +337,19 @@ def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
     text = evaluate.text("md")
     assert "\nbrick: Its photos differ.\n" in text and "Curve of" not in text and "\nattic: of the start\n" in text
     write_cfg_args(tmp_path, argparse.Namespace())
-    assert shorter_ends_there(tmp_path)  # as a schedule of --iterations does not
+    assert shorter_ends_there(tmp_path, 1000)  # as a schedule of --iterations does not
+    assert not shorter_ends_there(tmp_path, 999)  # whose SH bands are raised sooner
     (tmp_path / SCHEDULE).touch()
-    assert not shorter_ends_there(tmp_path)
+    assert not shorter_ends_there(tmp_path, 1000)
+
+
+def test_what_many_trainings_said_stands_once():
+    known = {"scene": "attic", "config": None, "model": "m"}
+    seeds = [known | {"seed": n, "lines": [f"Cut: {0.1**n:g}"]} for n in range(6)]
+    said = report_module._said([*seeds, known | {"seed": 6, "lines": None}])
+    title = "attic, seed 0; attic, seed 1; attic, seed 2; attic, seed 3 and 2 more"
+    assert said == [(title, "Cut: 1, of which others have other numbers")]  # 1e-05, for one
+    assert report_module._said(seeds) == []
 
 
 def test_seeds_of_different_ground_truth(evaluate):

@@ -104,6 +104,25 @@ def test_sh_degree_rises_every_interval_up_to_its_maximum(colmap_scene, tmp_path
     assert active == [min(t // 2, degree) for t in every]
 
 
+def test_a_training_of_less_than_an_interval_trains_all_sh_bands_in_the_same_share(colmap_scene, tmp_path, capsys):
+    every = range(1, 9)
+    _train(colmap_scene, tmp_path, "--checkpoint_iterations", *every, iterations=60)
+    assert [load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][0] for t in every] == [min(t // 2, 3) for t in every]
+    assert "their zeros" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("iterations", "said"), [(4, "; no SH band was trained"), (6, "; no SH band above degree 1 was")]
+)
+def test_bands_that_were_never_trained_are_told_with_what_leaves_them_out(
+    colmap_scene, tmp_path, monkeypatch, capsys, iterations, said
+):
+    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 4)
+    _train(colmap_scene, tmp_path, iterations=iterations)
+    printed = capsys.readouterr().out
+    assert said in printed and f"{73 if iterations == 4 else 58} % of it: --prune_sh 0 leaves them out" in printed
+
+
 @pytest.mark.slow
 def test_a_terminated_run_leaves_whole_files(colmap_scene, tmp_path):
     """While its threads decode photos. tests.kills: one that is killed."""

@@ -7,6 +7,8 @@ from torch import Tensor
 
 from splatting.distributed.rows import PIECE, WHOLE, Shards
 
+SH_INTERVAL = 1000  # iterations between raises of the active SH degree; shorter trainings raise it sooner
+
 
 def cut_bounds(f_rest: Tensor, shards: Shards = WHOLE, keep: Tensor | None = None) -> list[float]:
     """By degree d = 0..D: the most a colour can change, in any direction, when all bands above d are cut.

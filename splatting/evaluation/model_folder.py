@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from arguments.stored import read_model_json, read_stored_options
+from scene.gaussians.sh_bands import SH_INTERVAL
 from splatting.evaluation.error_curve import NAME as CURVE
 from splatting.evaluation.error_curve import Row, read_curve
 from splatting.evaluation.training_log import NAME as LOG
@@ -50,9 +51,12 @@ def trained_gaussians(model: Path, iteration: int) -> int:
     return trained if iteration == trained_iterations(model)[-1] and trained - unseen == saved else saved
 
 
-def shorter_ends_there(model: Path) -> bool:
-    """Whether a training with fewer --iterations ends with the model that a longer one has then; False if unknown."""
-    if (model / SCHEDULE).is_file():
+def shorter_ends_there(model: Path, iterations: int) -> bool:
+    """Tell whether a training of so many --iterations ends with the model that a longer one has then.
+
+    False if that is not known, and for so few that SH bands are raised sooner.
+    """
+    if (model / SCHEDULE).is_file() or iterations < SH_INTERVAL:
         return False
     try:
         options = read_stored_options(model)

@@ -38,7 +38,8 @@ RESIZE_FILTER = "Pillow, bicubic, antialiased where it shrinks; 8-bit pictures"
 _PHOTOGRAPHIC = 1 << 18  # bytes of a PNG above which a JPEG replaces it
 _QUALITY = 90
 _MEANT = re.compile(r"[\\`*\[\]<>&]")  # characters that begin or end Markdown's links, emphasis, code and HTML
-_NUMBER = re.compile(r"[\d.,]*\d")
+_NUMBER = re.compile(r"[\d.,]*\d(e[+-]\d+)?")
+_NAMED = 4  # trainings beside a line
 _ENTITIES = {"<": "&lt;", ">": "&gt;", "&": "&amp;"}
 
 Run = dict[str, Any]
@@ -256,14 +257,20 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _said(runs: Sequence[Run]) -> list[tuple[Run, list[str]]]:
-    """What trainings said at their ends, without what all of them said; other numbers make no other sentence."""
-    lines = [
-        {_NUMBER.sub("", x.replace(run["model"], "")): x for x in run["lines"] or () if not x.startswith(_WARNING)}
-        for run in runs
-    ]
-    own = [[text for key, text in of_run.items() if not all(key in other for other in lines)] for of_run in lines]
-    return [(run, texts) for run, texts in zip(runs, own, strict=True) if texts]
+def _said(runs: Sequence[Run]) -> list[tuple[str, str]]:
+    """List what only some trainings said at their ends: which, and the line; other numbers make no other line."""
+    by_form: dict[str, dict[str, str]] = {}
+    for run in runs:
+        for line in run["lines"] or ():
+            if not line.startswith(_WARNING):
+                by_form.setdefault(_NUMBER.sub("", line.replace(run["model"], "")), {})[run_title(run)] = line
+    said = []
+    for lines in by_form.values():
+        if len(lines) < len(runs):
+            others = "" if len({*lines.values()}) == 1 else ", of which others have other numbers"
+            more = f" and {len(lines) - _NAMED} more" if len(lines) > _NAMED else ""
+            said.append(("; ".join([*lines][:_NAMED]) + more, next(iter(lines.values())) + others))
+    return said
 
 
 def _trainings(runs: Sequence[Run]) -> str:

@@ -42,7 +42,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     if found := peak(curve):
         best = {"iteration": found[0]["iteration"], "test_psnr": found[0]["test_psnr"], "lost": found[1],
                 "gained": gain_since_peak(curve),
-                "shorter_ends_there": folder_of.shorter_ends_there(model)}  # fmt: skip
+                "shorter_ends_there": folder_of.shorter_ends_there(model, found[0]["iteration"])}  # fmt: skip
     saved = folder_of.trained_iterations(model)
     views = {"final_iteration": None, "iterations": {}, "split": None, "test_sizes": [], "worst_views": [],
              "views": {"test": None, "train": None}}  # fmt: skip

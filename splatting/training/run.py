@@ -19,6 +19,7 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
+from scene.gaussians.sh_bands import SH_INTERVAL
 from scene.scene import Scene
 from scene.sleeping import Sleeping
 from scene.splats.splats import Splats
@@ -42,12 +43,10 @@ from splatting.training.agreement import agree_on_scene
 from splatting.training.iteration import Iteration, OwnSize, ViewOrder
 from splatting.training.objective import LossWatch, Objective
 from splatting.training.save import Checkpoints
-from splatting.training.schedule import Schedule
+from splatting.training.schedule import USUAL, Schedule
 from splatting.training.trim_report import TrimReport, trimmed
 from splatting.training.watch import DivergenceWatch, check_drawn
 from utils.system_utils import UserError, compute_device
-
-SH_INTERVAL = 1000  # iterations between raises of the active SH degree
 
 
 class Run:
@@ -315,13 +314,16 @@ class Run:
         return self._raises_degree(iteration) > 0 or changes
 
     def _raises_degree(self, iteration: int) -> int:
-        """How often the SH degree is raised in an iteration, in a steady run also where it cannot rise further.
+        """Count the raises of the SH degree in an iteration, in a long steady run also where it cannot rise further.
 
         All blocks of rows wake then, which decides how values of rows that sleep are rounded.
         """
-        if self.schedule.paced and self.gaussians.active_sh_degree == self.gaussians.max_sh_degree:
+        schedule, gaussians = self.schedule, self.gaussians
+        short = schedule.length < SH_INTERVAL
+        if (schedule.paced or short) and gaussians.active_sh_degree == gaussians.max_sh_degree:
             return 0
-        before, now = (self.schedule.schedule_step(t) // SH_INTERVAL for t in (iteration - 1, iteration))
+        every = max(schedule.length * SH_INTERVAL // USUAL, 1) if short else SH_INTERVAL
+        before, now = (schedule.schedule_step(t) // every for t in (iteration - 1, iteration))
         return now - before
 
     def _background(self, iteration: int) -> Tensor:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import FEW, ITERATIONS_PER_VIEW, TOO_LONG, WORTH, change_on_views, trim
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.sh_bands import needed_degree
 
 if TYPE_CHECKING:
     from splatting.training.run import Run
@@ -42,11 +43,22 @@ def saved_line(it: TrimReport, folder: Path) -> str:
     size = f"{(it.ply_bytes - it.ply_bytes_saved) / MB:.2f} MB"
     if it.sh_degree < it.max_sh_degree:
         size += f"; SH bands above degree {it.sh_degree} left out"
+    elif (trained := needed_degree(it.cut_bounds, 0.0)) < it.sh_degree:
+        above = f" above degree {trained}" if trained else ""
+        share = 100 * _band_bytes(it, trained) / (it.ply_bytes - it.ply_bytes_saved)
+        size += (
+            f"; no SH band{above} was trained, and their zeros are {share:.0f} % of it: --prune_sh 0 leaves them out"
+        )
     line = f"Saved {it.gaussians - it.unseen:,} Gaussians to {folder} ({size})"
     if not it.unseen:
         return line
     why = "(opacity below 1/255)" if it.unseen == it.faint else "(no view depends on them)"
     return f"{line}. Left out {it.unseen:,} invisible Gaussians {why}{_change(it.test_change)}"
+
+
+def _band_bytes(it: TrimReport, degree: int) -> int:
+    """Bytes of the SH bands above a degree in the PLY that was saved."""
+    return 12 * ((it.max_sh_degree + 1) ** 2 - (degree + 1) ** 2) * (it.gaussians - it.unseen)
 
 
 def lines(it: TrimReport) -> list[str]:
@@ -84,8 +96,7 @@ def _change(change: dict[str, float]) -> str:
 
 def _bands(it: TrimReport) -> str:
     if it.sh_degree < it.max_sh_degree:
-        rows = it.gaussians - it.unseen
-        saved = 12 * ((it.max_sh_degree + 1) ** 2 - (it.sh_degree + 1) ** 2) * rows / MB
+        saved = _band_bytes(it, it.sh_degree) / MB
         bound = it.cut_bounds[it.sh_degree]
         moved = f"colours move by at most {bound:.2g} (values 0 to 1)" if bound else "they are zero throughout"
         return f"Left out the SH bands above degree {it.sh_degree} ({saved:.2f} MB of the PLY): {moved}"
