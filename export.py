@@ -205,15 +205,18 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     if getattr(pipe, "projection", "ewa") == "ray":
         print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
+    in_place: dict[tuple[int, bool], tuple[Splats, Around | None]] = {}
     for to, entry in zip(args.to, entries, strict=True):
         chosen = splats_for(to)
         start = time.perf_counter()
-        around = None
-        if entry.of_scene:
-            cameras = scene.getTrainCameras() if scene else circle(chosen.means)
-            details = {name: getattr(args, name) for name in _DETAILS}
-            around = Around(cameras, background, pipe, make_path, **details)
-        chosen, around = placed(args, entry.of_scene, chosen, around)
+        if (key := (id(chosen), entry.of_scene)) not in in_place:
+            around = None
+            if entry.of_scene:
+                cameras = scene.getTrainCameras() if scene else circle(chosen.means)
+                details = {name: getattr(args, name) for name in _DETAILS}
+                around = Around(cameras, background, pipe, make_path, **details, made={})
+            in_place[key] = placed(args, entry.of_scene, chosen, around)
+        chosen, around = in_place[key]
         what = entry.write(to, chosen, *((around,) if around else ()))
         print(f"Wrote {to}: {_told(to, entry, what, chosen, splats, args)}, {time.perf_counter() - start:.1f} s")
         if "walk" in entry.options and len(chosen) > FOR_PHONES:

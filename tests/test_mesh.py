@@ -23,9 +23,9 @@ from scene.scene import Scene
 from scene.splats.splats import Splats
 from scene.with_splats import model_of
 from splatting.demo.make_scene import make_scene
-from splatting.exports import mesh
+from splatting.exports import html, mesh
 from splatting.exports.formats import Around, format_of
-from splatting.exports.mesh import Mesh, fewer, mesh_of, vertex_normals, volume_of, zero_level
+from splatting.exports.mesh import Mesh, fewer, measure, mesh_of, vertex_normals, volume_of, zero_level
 from splatting.exports.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims, whole_parts
 from splatting.exports.mesh_files import write_ply_mesh
 from splatting.exports.surfaces import Surfaces, pinholes
@@ -68,7 +68,7 @@ def views() -> list:
 
 @pytest.fixture(scope="module")
 def of_ball(ball, views) -> Mesh:
-    return mesh_of(ball, views, pipeline(), VOXEL)[0]
+    return mesh_of(*measure(ball, views, pipeline(), VOXEL))[0]
 
 
 def test_the_median_depth_is_that_of_the_surface_in_front(views):
@@ -192,7 +192,7 @@ def of_two_halves(ball, views) -> Mesh:
     """A mesh with a texture, of a ball that is green on one side and red on the other."""
     sh = np.where(ball.means[:, None, None, 0] > CENTRE[0], np.array([0.1, 0.7, 0.1]), np.array([0.7, 0.1, 0.1]))
     halves = replace(ball, sh=((sh.reshape(-1, 1, 3) - 0.5) / C0).astype(np.float32))
-    return mesh_of(halves, views, pipeline(), VOXEL, 1000, True)[0]
+    return mesh_of(*measure(halves, views, pipeline(), VOXEL), 1000, True)[0]
 
 
 def read_usdz(path: Path) -> tuple[np.ndarray, ...]:
@@ -224,6 +224,7 @@ def read_by_trimesh(path: Path) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("ending", ["glb", "obj", "usdz"])
 def test_other_programs_read_meshes_with_their_textures(tmp_path, monkeypatch, ending, ball, of_two_halves):
+    monkeypatch.setattr("splatting.exports.mesh.measure", lambda *_: ())
     monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (of_two_halves, ""))
     path = tmp_path / f"a ball.mesh.{ending}"
     entry = format_of(path)
@@ -271,10 +272,10 @@ def test_too_small_voxels_are_refused_or_enlarged(ball, views, monkeypatch):
 def test_without_surfaces_there_is_no_mesh(ball, views):
     ball.opacity_logits[:], before = -4.0, ball.opacity_logits.copy()
     with pytest.raises(UserError, match="no training view shows anything opaque"):
-        mesh_of(ball, views, pipeline(), VOXEL)
+        mesh_of(*measure(ball, views, pipeline(), VOXEL))
     ball.opacity_logits[:] = before
     with pytest.raises(UserError, match="a mesh needs training cameras"):
-        mesh_of(ball, [], pipeline(), VOXEL)
+        measure(ball, [], pipeline(), VOXEL)
 
 
 @pytest.fixture(scope="module")
@@ -297,6 +298,19 @@ def test_the_mesh_of_a_traced_scene_lies_on_its_surfaces(trained, monkeypatch, c
     # Measured: 0.046 and 0.080; cameras are 3.6 away.
     assert accuracy < 0.06 and completeness < 0.1
     assert float(few[6].split(",")[1]) > 20  # dB
+
+
+def test_files_of_one_call_share_what_is_slow(ball, views, tmp_path, monkeypatch):
+    """Surfaces of all meshes, the mesh of those with a texture, and the packed model of pages."""
+    made, pages, around = [], [], Around(views, (0, 0, 0), pipeline(), voxel=2 * VOXEL, made={})
+    for name in ("volume_of", "textured"):
+        plain = getattr(mesh, name)
+        monkeypatch.setattr(mesh, name, lambda *a, n=name, f=plain: made.append(n) or f(*a))
+    monkeypatch.setattr(html, "_packed_model", lambda splats: pages.append(splats) or "")
+    for name in ("mesh.ply", "a.mesh.glb", "b.mesh.obj", "a.html", "b.html"):
+        format_of(name).write(tmp_path / name, ball, around)
+        assert (tmp_path / name).stat().st_size > 1000
+    assert made == ["volume_of", "textured"] and len(pages) == 1
 
 
 @pytest.mark.slow

@@ -53,6 +53,14 @@ class Around(NamedTuple):
     upright: bool = False  # whether -y of all of these is up, so that a page need not find it
     metric: bool = False  # whether the unit is known to be a metre
     triangles: int | None = None  # of a mesh, at most
+    made: dict[Any, Any] | None = None  # what other files of the same splats and options have made, by name
+
+    def once(self, name: Any, make: Callable[..., Any], *given: Any) -> Any:
+        """Make what several files need, for the first of them only."""
+        made = {} if self.made is None else self.made
+        if name not in made:
+            made[name] = make(*given)
+        return made[name]
 
 
 @dataclass(frozen=True)
@@ -92,8 +100,8 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
     if around.walk:
         from splatting.exports.walking import solid_of, walkable
 
-        splats, around = walkable(splats, around)
-        solid = solid_of(splats, around.cameras, around.pipe)
+        splats, around = around.once("walkable", walkable, splats, around)
+        solid = around.once("solid", solid_of, splats, around.cameras, around.pipe)
     notes = read_notes(around.notes) if around.notes else None
     names = [str(camera.image_name) for camera in around.cameras]
     if around.start is not None:
@@ -104,7 +112,7 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
         start = best_start(poses_of(around.cameras)) if names else 0
     picture = _picture_of(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
-    write_html(path, splats, around.cameras, *how, around.upright, around.metric, notes, solid)
+    write_html(path, splats, around.cameras, *how, around.upright, around.metric, notes, solid, around.once)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
@@ -118,10 +126,10 @@ def _mesh(
     """A format of meshes, with a texture or with colours of vertices."""
 
     def write_mesh(path: str | os.PathLike, splats: Splats, around: Around) -> str:
-        from splatting.exports.mesh import mesh_of  # as does this
+        from splatting.exports.mesh import measure, mesh_of  # as does this
 
-        how = around.pipe, around.voxel, around.triangles, with_texture
-        mesh, text = mesh_of(splats, around.cameras, *how)
+        measured = around.once("surfaces", measure, splats, around.cameras, around.pipe, around.voxel)
+        mesh, text = around.once(with_texture, mesh_of, *measured, around.triangles, with_texture)
         write(path, with_z_up(mesh) if around.upright and not with_texture else mesh, splats)
         return text
 

@@ -69,6 +69,7 @@ def write_html(
     metric: bool = False,
     notes: Notes | None = None,
     solid: "Solid | None" = None,
+    once: Callable[..., str] = lambda _, make, *given: make(*given),
 ) -> None:
     """Write the page, whole or not at all.
 
@@ -78,8 +79,9 @@ def write_html(
     of the notes, or the file's name. start: which camera the page begins at. picture: address of an image that is shown
     beside a link to the page; empty: none. upright: whether up is UP already; if not, it is found by the cameras.
     metric: whether a unit is a metre; if not, a headset shows the model as if photos were taken from two metres. solid:
-    what guests stop at when they walk, in the viewer's axes; None: they cannot walk. UserError without a camera, or
-    where notes name one that is not there.
+    what guests stop at when they walk, in the viewer's axes; None: they cannot walk. once: calls what makes the packed
+    model, or gives that of a page before (`Around.once`). UserError without a camera, or where notes name one that is
+    not there.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
@@ -103,7 +105,7 @@ def write_html(
     }
     content = _template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
-        model=_packed_model(rotated(splats, turn)),
+        model=once("packed", lambda: _packed_model(rotated(splats, turn))),
         notes=notes,
         # No text in the JSON may end the script element that it stands in.
         picture=picture,

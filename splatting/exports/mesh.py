@@ -45,20 +45,21 @@ class Mesh:
     texture: np.ndarray | None = None
 
 
+def measure(
+    splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace, voxel: float | None = None
+) -> tuple[Surfaces, Volume]:
+    """Surfaces of splats and the distances from them. UserError as for `Surfaces` and `volume_of`."""
+    surfaces = Surfaces(splats, cameras, pipe)
+    return surfaces, volume_of(surfaces, voxel)
+
+
 def mesh_of(
-    splats: Splats,
-    cameras: Sequence[Camera],
-    pipe: argparse.Namespace,
-    voxel: float | None = None,
-    triangles: int | None = None,
-    with_texture: bool = False,
+    surfaces: Surfaces, volume: Volume, triangles: int | None = None, with_texture: bool = False
 ) -> tuple[Mesh, str]:
-    """The clean mesh of splats, and a part of a sentence about it. UserError as for `Surfaces` and `volume_of`.
+    """Make the clean mesh of surfaces, and a part of a sentence about it. UserError where nothing is left.
 
     triangles: at most. None: TRIANGLES of a mesh with a texture, and all of one with colours.
     """
-    surfaces = Surfaces(splats, cameras, pipe)
-    volume = volume_of(surfaces, voxel)
     vertices, every = whole_parts(*zero_level(volume, min(CONFIRMED, len(surfaces.views))))
     vertices, faces = fewer(
         smooth_rims(vertices, every), every, triangles or (TRIANGLES if with_texture else len(every))

@@ -1,5 +1,7 @@
 """A texture for a mesh: a flat layout by xatlas, and colours of the surface under each of its pixels."""
 
+import sys
+
 import numpy as np
 from PIL import Image, ImageDraw
 
@@ -17,6 +19,7 @@ def textured(
     vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, surfaces: Surfaces, voxel: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, None, np.ndarray, np.ndarray]:
     """The values of a `Mesh` with a texture. Vertices where charts meet are there for each chart."""
+    print(f"Laying out {len(faces):,} triangles in an image", file=sys.stderr)
     area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum() / 2
     rows, faces, uv, size = _layout(vertices, faces, normals, int(min(_LARGEST, area**0.5 / surfaces.pixel)))
     vertices, normals = vertices[rows], normals[rows]
