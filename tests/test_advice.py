@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from waiting import wait_for
 
 import train
 from arguments import OptimizationParams
@@ -53,15 +54,23 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
     assert [one["options"] for one in json.loads((tmp_path / advice.ADVICE).read_text())] == ["--sky auto", "", ""]
 
 
-def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves_no_process(tmp_path):
+def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves_no_process(tmp_path, capfd):
     with pytest.raises(UserError, match="^no scene$"):
-        advice._trained([sys.executable, "-c", "import sys; sys.exit('x\\nerror: no scene')"])
+        advice._trained([sys.executable, "-c", "import sys; sys.exit(' 50%|##\\nx\\nerror: no scene')"])
+    assert capfd.readouterr().err == " 50%|##\n"
     number = tmp_path / "number"
     code = f"import os, time; open({str(number)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
     # The handler of SIGINT, which a program in the background ignores, runs where the main thread is interrupted.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    timer = threading.Timer(1.0, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT])
-    timer.start()
+    main = threading.main_thread().ident
+
+    def interrupt() -> None:
+        try:
+            wait_for(lambda: number.exists() and number.read_text())
+        finally:
+            signal.pthread_kill(main, signal.SIGINT)
+
+    threading.Thread(target=interrupt).start()
     try:
         with pytest.raises(KeyboardInterrupt):
             advice._trained([sys.executable, "-c", code])

@@ -4,6 +4,7 @@ import io
 import json
 import time
 from itertools import count
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -11,7 +12,7 @@ import torch
 from tqdm import tqdm
 
 import train
-from splatting.host.progress import Bar
+from splatting.host.progress import Bar, in_threads
 from splatting.part import Part, Strategy
 from splatting.training.log import ProgressBar
 from splatting.training.loop import standard_observers
@@ -19,6 +20,13 @@ from splatting.training.objective import LossWatch
 from splatting.training.schedule import Schedule
 
 ITERATIONS = 24
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def _without_bands(monkeypatch) -> None:
+    """No raise of the SH degree is due in iterations as few as these."""
+    monkeypatch.setattr("splatting.training.run.USUAL", 1)
 
 
 class Recorder(Part):
@@ -168,6 +176,14 @@ def test_a_log_gets_a_line_in_ten_seconds_and_a_last_one(monkeypatch, seconds):
     for _ in Bar(range(3), file=(shown := Terminal())):
         pass
     assert "0%" in shown.getvalue() and "100%" in shown.getvalue()
+
+
+def test_work_in_threads_is_one_line_of_a_log_wherever_it_is():
+    log = io.StringIO()
+    assert in_threads(lambda number: 2 * number, range(50), file=log, mininterval=0) == [*range(0, 100, 2)]
+    assert log.getvalue().count("\n") == 1 and "\r" not in log.getvalue()
+    code = [path for room in ("scene", "splatting", "utils") for path in (ROOT / room).rglob("*.py")]
+    assert [path.name for path in code if "tqdm.contrib" in path.read_text()] == ["progress.py"]
 
 
 def test_the_number_of_gaussians_is_exact(capsys):

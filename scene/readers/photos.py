@@ -17,7 +17,6 @@ import numpy as np
 from diff_gaussian_rasterization.lens import MODELS, lens_of
 from PIL import ExifTags, Image
 from PIL.PngImagePlugin import PngInfo
-from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import decode, picture_size, picture_sizes
 from scene.images.lens import (
@@ -37,7 +36,7 @@ from splatting.files.folders import cache_folder, remove_temporary_files
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.files.plain_files import plain
 from splatting.host.listing import some
-from splatting.host.machine import threads
+from splatting.host.progress import in_threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
 
 FARTHEST = 1e12  # from the origin, beyond which lie damaged files; there a double has steps of 1e-4
@@ -169,7 +168,7 @@ def _made(folder: Path, kind: str) -> Path:
 
 def _in_threads(work: Callable[[Job], Result], jobs: Iterable[Job], title: str) -> list[Result]:
     # pycolmap, Pillow and hashlib release Python's lock while they work.
-    return thread_map(work, jobs, max_workers=threads(), desc=title, unit="photo", leave=False)
+    return in_threads(work, jobs, desc=title, unit="photo", leave=False)
 
 
 def _is_exchanged(camera: CameraInfo) -> bool:

@@ -40,8 +40,8 @@ _ITERATIONS = 1000  # of the short training
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False) -> list[Finding]:
-    """Advice on a scene. dataset: the model options. trains: ask by a short training, too.
+def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False) -> Iterator[Finding]:
+    """Advise on a scene, each thing as soon as it is known. dataset: the model options. trains: train shortly, too.
 
     warns: print what the check of the scene finds, too. UserError as from Scene, and where the scene cannot be trained.
     """
@@ -53,9 +53,12 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     if trains:
         tell(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
-    found = [*_of_tracks(scene, tracks)] if any(tracks) else []
-    found += [one for advise_part in tools("advise") for one in advise_part(scene, tracks)]
-    return [*found, *_of_short_training(dataset)] if trains else found
+    if any(tracks):
+        yield from _of_tracks(scene, tracks)
+    for advise_part in tools("advise"):
+        yield from advise_part(scene, tracks)
+    if trains:
+        yield from _of_short_training(dataset)
 
 
 def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: Sequence[str]) -> list[str]:
@@ -70,8 +73,10 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
         )
     if written := args.advise and dataset.model_path:
         mkdir_p(dataset.model_path)  # if it cannot be, better before the search
-    found = advise(dataset, warns=args.advise)  # a training that follows prints them itself
-    print(*found, sep="\n")
+    found = []
+    for advice in advise(dataset, warns=args.advise):  # a training that follows prints them itself
+        print(advice, flush=True)
+        found.append(advice)
     found = [_taken(advice, args, given) for advice in found]
     if written:
         write_json(
@@ -108,7 +113,7 @@ def check_options(source: str, images: str, model: str | None = None) -> list[Fi
     dataset = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=source, images=images))
     dataset.lenses = "native"
     try:
-        found = advise(dataset, trains=False)
+        found = [*advise(dataset, trains=False)]
     except UserError:
         return []
     return [advice for advice in found if advice.options and advice.options.split()[0] not in then]
@@ -152,10 +157,18 @@ def _data_words(dataset: argparse.Namespace) -> list[str]:
 
 
 def _trained(line: list[str]) -> None:
-    """Run a training to its end, also where a signal interrupts it. UserError with the last message if it fails."""
+    """Run a training to its end, also where a signal interrupts it, and show how far it is.
+
+    UserError with its last message if it fails.
+    """
+    said = ""
     with subprocess.Popen(line, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as child:
         try:
-            said = child.communicate()[1]
+            for text in child.stderr:
+                if "%|" in text:
+                    print(text, end="", file=sys.stderr, flush=True)
+                else:
+                    said += text
         except BaseException:  # Popen itself leaves a child behind after Ctrl-C
             child.kill()
             child.wait()
@@ -169,6 +182,7 @@ def _of_short_training(dataset: argparse.Namespace) -> Iterator[Finding]:
     with tempfile.TemporaryDirectory() as folder:
         own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
         own += ["--no_last_checkpoint"]
+        print(f"{_ITERATIONS:,} iterations on photos of {_WIDTH} pixels show what the records do not", flush=True)
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
         scene, views = load_scored(folder)
         for advise_part in tools("advise_trained"):

@@ -1,9 +1,13 @@
 """Progress bars: a line that is drawn anew on a terminal, and in a log file a new line now and then."""
 
 import time
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from tqdm import tqdm
+from tqdm.contrib.concurrent import thread_map
+
+from splatting.host.machine import threads
 
 INTERVAL = 10.0  # seconds between the lines in a log
 
@@ -48,3 +52,8 @@ class Bar(tqdm):
             self._line = line
             self.fp.write(f"{line}\n")
             getattr(self.fp, "flush", lambda: None)()
+
+
+def in_threads(work: Callable[..., Any], *jobs: Iterable[Any], **options: Any) -> list[Any]:
+    """Map jobs to their results, in order, on as many threads as the processor has, behind a bar with `options`."""
+    return thread_map(work, *jobs, max_workers=threads(), tqdm_class=Bar, dynamic_ncols=True, **options)

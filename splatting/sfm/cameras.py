@@ -4,11 +4,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
-from tqdm.contrib.concurrent import thread_map
-
 from scene.images.decode import picture_size
 from scene.images.exif import Lens, read_lens
-from splatting.host.machine import threads
+from splatting.host.progress import in_threads
 
 MODES = ("per_lens", "per_folder", "per_photo", "shared")
 _MOST_LISTED = 12
@@ -76,4 +74,4 @@ def described(cameras: Sequence[dict[str, Any]], known: dict[str, Lens]) -> list
 
 
 def _all(read: Callable[[Path], Any], folder: Path, names: Sequence[str]) -> list[Any]:
-    return thread_map(lambda name: read(folder / name), names, max_workers=threads(), disable=True)
+    return in_threads(lambda name: read(folder / name), names, disable=True)

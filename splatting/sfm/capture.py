@@ -9,20 +9,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from tqdm.contrib.concurrent import thread_map
 
 from scene.images.exposures import exposures
 from scene.readers.colmap import read_model
 from splatting.findings.capture import SHARED, Look
 from splatting.findings.photo_files import sharpness, small
-from splatting.host.machine import threads
+from splatting.host.progress import in_threads
 from splatting.sfm.layout import Layout
 
 
 def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:
     """Sharpness and brightness of photos in a folder, by name."""
-    found = thread_map(lambda name: _look(folder / name), names, max_workers=threads(), desc="Looking at photos",
-                       dynamic_ncols=True)  # fmt: skip
+    found = in_threads(lambda name: _look(folder / name), names, desc="Looking at photos")
     return dict(zip(names, found, strict=True))
 
 
@@ -40,9 +38,9 @@ def compared(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
     model = read_model(layout.sparse / "0", with_2d_points=True)
     images = [image for image in model.images if image.name in looks]
     sizes = [(model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) for image in images]
-    seen = thread_map(
+    seen = in_threads(
         lambda image, size: _at_points(layout.images / image.name, image.xys / size, image.point3D_ids),
-        images, sizes, max_workers=threads(), desc="Comparing photos", dynamic_ncols=True,
+        images, sizes, desc="Comparing photos",
     )  # fmt: skip
     enough = [number for number, (points, _) in enumerate(seen) if len(points) >= SHARED]
     found = {image.name: looks[image.name]._replace(brightness=math.nan) for image in images}

@@ -12,7 +12,6 @@ from typing import Any
 import jinja2
 import numpy as np
 from PIL import Image, ImageOps
-from tqdm.contrib.concurrent import thread_map
 
 from scene.readers.info import from_above
 from splatting.files.color_profiles import in_srgb
@@ -28,7 +27,7 @@ from splatting.findings.capture import (
     unusable,
     worth,
 )
-from splatting.host.machine import threads
+from splatting.host.progress import in_threads
 from splatting.sfm.capture import compared, looks_of
 from splatting.sfm.layout import Layout, image_names
 from splatting.sfm.mapping import name_of
@@ -66,7 +65,7 @@ def write_page(
     photos = _photos(report, survey["photos"], looks, names)
     pictured = [photo for photo in photos if photo["problems"] or len(photos) <= _MOST][:_MOST]
     files = [root / photo["name"] for photo in pictured]
-    thumbnails = thread_map(_thumbnail, files, max_workers=threads(), desc="Making thumbnails", dynamic_ncols=True)
+    thumbnails = in_threads(_thumbnail, files, desc="Making thumbnails")
     for photo, thumbnail in zip(pictured, thumbnails, strict=True):
         photo["thumbnail"] = thumbnail
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}

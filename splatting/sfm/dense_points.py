@@ -15,12 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample
-from tqdm.contrib.concurrent import thread_map
 
 from splatting.files.color_profiles import in_srgb
 from splatting.files.image_files import open_image
-from splatting.host.machine import threads
-from splatting.host.progress import Bar
+from splatting.host.progress import Bar, in_threads
 
 SIDE = 800  # pixels of a photo's longer side
 _COARSE = 4  # times smaller photos, in which all depths are tried
@@ -93,7 +91,7 @@ def more_points(
             views = {name: views[name] for name in wanted if name in views}
             new = [name for name in wanted if name not in views]
             load = partial(_load, images, photos, origin, device)
-            views |= zip(new, thread_map(load, new, max_workers=threads(), disable=True), strict=True)
+            views |= zip(new, in_threads(load, new, disable=True), strict=True)
             for number, name in enumerate(part, start):
                 beside = [views[other] for other in others[name]]
                 found, shades = _of_photo(views[name], beside, depths[name], each, number)

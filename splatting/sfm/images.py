@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from PIL import Image, ImageOps
-from tqdm.contrib.concurrent import thread_map
 
 from scene.images.decode import picture_size
 from scene.images.find import SideFiles
@@ -19,7 +18,7 @@ from splatting.files.color_tags import mark_srgb
 from splatting.files.image_files import SUFFIXES, UNREADABLE, open_image
 from splatting.findings import Finding
 from splatting.findings.photos import Photo, check_shared, looks_at
-from splatting.host.machine import threads
+from splatting.host.progress import in_threads
 from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
@@ -249,7 +248,7 @@ def _in_threads(
             return error
         return None
 
-    attempts = thread_map(attempt, names, max_workers=threads(), desc=title, dynamic_ncols=True)
+    attempts = in_threads(attempt, names, desc=title)
     faults = [fault for fault in attempts if fault]
     if len(faults) == 1:
         raise faults[0]
