@@ -2,7 +2,8 @@
 
 The Gaussians of a view are divided by their depths into slabs of equal numbers. An image is linear in what Gaussians
 carry, so one image of two channels a slab has the sums of its blending weights, and of weights times depths. The slab
-in which the weights from the front reach one half has the median, and its mean is the depth.
+in which the weights from the front reach one half has the median, and its mean is the depth. At a single pixel, all
+weights are known.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer import render
+from gaussian_renderer.blending import weighted_sums
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 
@@ -35,7 +37,9 @@ def surface_of(camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argpars
     means = gaussians.get_xyz
     clip = means @ camera.full_proj_transform[:, [0, 1, 3]][:3] + camera.full_proj_transform[3, [0, 1, 3]]
     depths = clip[:, 2].contiguous()
-    seen = depths[(depths > 0) & (clip[:, :2].abs() < depths[:, None]).all(1)].sort().values
+    ahead = depths > 0
+    within = ahead & (clip[:, :2].abs() < depths[:, None]).all(1)
+    seen = depths[within if within.any() else ahead].sort().values  # a Gaussian may reach it from beside
     if not len(seen):
         size = camera.image_height, camera.image_width
         return Surface(means.new_zeros(size), means.new_zeros(3, *size))
@@ -54,3 +58,23 @@ def _median(weights: Tensor, depths: Tensor) -> Tensor:
     found = (reached < _HALF).sum(0, keepdim=True).clamp_max(SLABS - 1)
     mean = depths.gather(0, found) / weights.gather(0, found)
     return torch.where(reached[-1] < _HALF, 0, mean[0])
+
+
+@torch.no_grad()
+def median_at(
+    camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, column: int, row: int
+) -> float:
+    """The median depth at one pixel, as in `Surface`, by the weights of all Gaussians that reach it."""
+
+    def pixel(image: Tensor) -> Tensor:
+        only = torch.zeros_like(image)
+        only[:, row, column] = 1
+        return only
+
+    means = gaussians.get_xyz
+    weights = weighted_sums(camera, gaussians, pipe, means.new_zeros(3), pixel)[:, 0]
+    found = weights.nonzero()[:, 0]
+    along = camera.full_proj_transform[:, 3]
+    depths, order = (means[found] @ along[:3] + along[3]).sort(stable=True)
+    reached = weights[found[order]].cumsum(0) >= _HALF
+    return float(depths[reached.int().argmax()]) if reached.any() else 0.0

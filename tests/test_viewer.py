@@ -15,6 +15,7 @@ from synthetic import options_of
 from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth
 from gaussian_renderer.free_view import free_view
+from gaussian_renderer.median_depth import surface_of
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.splats.reading import read_splats
@@ -195,6 +196,15 @@ def test_the_surface_along_a_ray_is_found_where_there_is_one():
     ray = np.array([0.5, -0.2, 4]) / np.linalg.norm([0.5, -0.2, 4])
     np.testing.assert_allclose(frames.surface(PLAIN, FRONT, ray), [0.5, -0.2, 0], atol=1e-3)
     assert frames.surface(PLAIN, FRONT, np.array([0.0, 0, 1])) is None
+
+
+def test_the_surface_of_a_large_gaussian_is_found_far_from_its_mean():
+    ray = np.array([0.0, 0, 1])
+    mean = np.float32([[4 * np.tan(np.radians(10)), 0, 0]])
+    gaussians = model_of(_spheres(mean, np.ones((1, 3), np.float32), 1.0))
+    np.testing.assert_allclose(Frames(gaussians, SceneCameras([], []), pipeline(), False).surface(PLAIN, FRONT, ray), 0)
+    beside = free_view(17, 17, np.radians(10), FRONT.position, FRONT.wxyz, "cpu")  # its mean is not in this view
+    assert float(surface_of(beside, gaussians, pipeline()).depth[8, 8]) == pytest.approx(4)
 
 
 def test_guesses_are_dark_and_photos_are_not(gaussians, scene_cameras):

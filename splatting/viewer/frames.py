@@ -14,10 +14,9 @@ from torch import Tensor
 from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth, view_planes
 from gaussian_renderer.free_view import free_view, rotation_matrix
-from gaussian_renderer.median_depth import surface_of
+from gaussian_renderer.median_depth import median_at
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from splatting.camera_paths.poses import facing, keyframe
 from splatting.files.image_files import dimmed, to_bytes
 from splatting.viewer import views
 from splatting.viewer.coverage import Coverage, darkened
@@ -28,8 +27,6 @@ from utils.image_utils import as_float
 LONGEST = 1600  # pixels of a frame's longer side, at most
 COARSE = 2  # a frame of a moving camera has a quarter of the pixels
 _BORDER = 0.15  # grey around a target that does not fill the window
-_ASKED = 17  # pixels of the sides of a view of one ray
-_WIDEST = 60.0  # degrees that these pixels see, in a window of few pixels
 _NO_PHOTO = "No photo was taken from here. “Go to the camera” (tab Photos) leads to one."
 
 
@@ -67,8 +64,7 @@ class Frames:
         """
         camera = self.compared(settings, pose)
         if camera is None:
-            scale = min(1.0, LONGEST / max(pose.width, pose.height)) / (COARSE if coarse else 1)
-            width, height = (max(1, round(side * scale)) for side in (pose.width, pose.height))
+            width, height = _size(pose, COARSE if coarse else 1)
             view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self.gaussians.get_xyz.device)
             image, words = self._image(settings, view)
             return Frame(to_bytes(image).numpy(), words._replace(warning=_NO_PHOTO if _needs_photo(settings) else ""))
@@ -88,16 +84,19 @@ class Frames:
     def surface(self, settings: Settings, pose: Pose, ray: np.ndarray) -> np.ndarray | None:
         """The point (3,) of the surface along a ray (3,) of a pose's window; None where there is none.
 
-        A view of few pixels along the ray tells it, each as large as one of the window.
+        Its depth is the median in the pixel that the ray goes through.
         """
-        axes = rotation_matrix(pose.wxyz)
-        place, turn = np.array(pose.position), facing(ray, -axes[:, 1])
-        key = keyframe(0.0, place, turn, min(_ASKED * math.degrees(pose.fov) / pose.height, _WIDEST))
-        device = self.gaussians.get_xyz.device
-        view = free_view(_ASKED, _ASKED, math.radians(key.fov), key.position, key.wxyz, device)
-        depth = surface_of(view, shown_part(self.gaussians, settings, self.kept), self._pipe).depth
-        away = float(depth[_ASKED // 2, _ASKED // 2])
-        return place + away * turn[:, 2] if away > 0 else None
+        axes, place = rotation_matrix(pose.wxyz), np.array(pose.position)
+        width, height = _size(pose)
+        right, down, ahead = ray @ axes
+        if ahead <= 0:
+            return None
+        focal = height / 2 / math.tan(pose.fov / 2)
+        column, row = round((width - 1) / 2 + focal * right / ahead), round((height - 1) / 2 + focal * down / ahead)
+        view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self.gaussians.get_xyz.device)
+        part = shown_part(self.gaussians, settings, self.kept)
+        depth = median_at(view, part, self._pipe, min(max(column, 0), width - 1), min(max(row, 0), height - 1))
+        return place + depth / ahead * ray if depth else None
 
     def compared(self, settings: Settings, pose: Pose) -> Camera | None:
         """The scene's camera whose target this frame shows, None: no target."""
@@ -129,6 +128,12 @@ class Frames:
         if settings.mode == views.ERROR and target is not None:
             return error_image(target, colour), ERROR_SCALE
         return colour, Legend()
+
+
+def _size(pose: Pose, coarser: int = 1) -> tuple[int, int]:
+    """The width and height of a frame, in pixels."""
+    scale = min(1.0, LONGEST / max(pose.width, pose.height)) / coarser
+    return max(1, round(pose.width * scale)), max(1, round(pose.height * scale))
 
 
 def _needs_photo(settings: Settings) -> bool:
