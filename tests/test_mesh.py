@@ -152,6 +152,15 @@ def test_a_surface_needs_the_views_that_it_is_asked_for(ball, views):
         zero_level(volume, 3)
 
 
+def sheets(count: int, points: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of rough squares, one over the other, with `points` vertices on each side."""
+    places = np.indices((count, points, points)).reshape(3, -1).T.astype(np.float32)
+    places[:, 0] = 10 * places[:, 0] + np.random.default_rng(0).normal(scale=0.5, size=len(places))
+    corner = np.arange(len(places)).reshape(count, points, points)
+    a, b, c, d = corner[:, :-1, :-1], corner[:, :-1, 1:], corner[:, 1:, :-1], corner[:, 1:, 1:]
+    return places, np.stack([a, b, c, b, d, c], -1).reshape(-1, 3).astype(np.int32)
+
+
 def test_fewer_triangles_lie_on_the_same_surface(of_ball):
     vertices, faces = fewer(of_ball.vertices, of_ball.faces, 500)
     away = vertices - CENTRE
@@ -162,6 +171,13 @@ def test_fewer_triangles_lie_on_the_same_surface(of_ball):
     whole = np.float32(whole.vertices), np.int32(whole.faces)
     with pytest.raises(UserError, match="--triangles 1 leaves nothing of the mesh; give more"):
         fewer(*whole, 1)
+    assert len(fewer(*sheets(40, 4), 100)[1]) <= 100
+    with pytest.raises(
+        UserError, match=r"--triangles 100 is too few for the rims of this mesh; give \d+ or more"
+    ) as too_few:
+        fewer(*sheets(200, 3), 100)
+    most = int(str(too_few.value).split()[-3])
+    assert 100 < len(fewer(*sheets(200, 3), most)[1]) <= most
     with pytest.raises(UserError, match="all surfaces are too narrow for a mesh; give a smaller --voxel"):
         whole_parts(of_ball.vertices, of_ball.faces[:2], np.ones(len(of_ball.vertices)))
 

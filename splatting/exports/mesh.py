@@ -157,12 +157,20 @@ def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
 
 
 def fewer(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface of `triangles`, or some fewer; of all if they are no more. UserError if none would be left."""
+    """The same surface of `triangles`, or some fewer; of all if they are no more.
+
+    UserError if none would be left, or if the rims of the surface need more.
+    """
     if len(faces) <= triangles:
         return vertices, faces
     from fast_simplification import simplify
 
-    vertices, faces = simplify(vertices, faces, target_count=triangles)
+    before = len(faces) + 1
+    while triangles < len(faces) < before:  # a call ends where what is left costs too much for its first errors
+        before = len(faces)
+        vertices, faces = simplify(vertices, faces, target_count=triangles)
+    if len(faces) > triangles:
+        raise UserError(f"--triangles {triangles} is too few for the rims of this mesh; give {len(faces)} or more")
     # Two faces with the same corners are left of what has closed, back to back.
     _, same, times = np.unique(np.sort(faces, axis=1), axis=0, return_inverse=True, return_counts=True)
     used, faces = np.unique(faces[times[same.reshape(-1)] == 1], return_inverse=True)
