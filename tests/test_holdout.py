@@ -69,6 +69,14 @@ def test_a_sector_spans_no_gap_that_the_cameras_leave():
     assert names(ring(arc)[:12], "sector") == ["0_06", "0_07"]
 
 
+@pytest.mark.parametrize("sway", [0.0, 0.05])
+def test_a_sector_spans_no_pause_of_a_video(sway):
+    paused = np.repeat(9.0 * np.arange(40), [61 if place == 20 else 1 for place in range(40)])
+    video = ring((paused + sway * np.random.default_rng(0).normal(size=100)).tolist())[:100]
+    assert names(video, "sector") == ["0_81", "0_82", "0_83", "0_84", "0_85"]
+    assert len(names(video[15:86], "sector")) <= 9  # begins at places behind the pause
+
+
 def test_a_block_is_in_the_middle_of_the_names_and_every_8th_is_as_before():
     cameras = ring([15.0 * i for i in range(10)])
     order = [one.image_name for one in cameras]

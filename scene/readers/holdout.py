@@ -16,6 +16,7 @@ from utils.system_utils import UserError
 
 EVERY = "every8"
 _WIDE = 2.0  # times the median sector; a wider one contains a gap that the cameras leave
+_SAME = 5e-3  # of the usual distance of a camera; one that is no farther from another one stands at its place
 _ROUNDED = 3  # decimals of degrees, so that cameras above each other have one angle
 
 
@@ -63,18 +64,27 @@ def _sector(cameras: Sequence[CameraInfo]) -> np.ndarray:
 
     The point is the nearest one to all optical axes; angles are about what is up for the cameras. The sector begins at
     the camera in the middle of the order of names and goes counter-clockwise, seen from above, until it has as many.
-    Where the cameras leave a gap in it, it begins at the next one by name whose sector has none. So it is the same in
-    any frame of the world. Cameras of its last angle all belong to it.
+    Where the cameras leave a gap in it, or it would have twice as many, it begins at the next one by name whose sector
+    has neither. So it is the same in any frame of the world. Cameras of its last angle all belong to it, and those that
+    stand at the place of another one, as where a video pauses, do not count.
     """
+    from scipy.spatial import cKDTree  # SciPy takes a while to import
+
     centers, turns = camera_centers(cameras), np.stack([camera.R for camera in cameras])
     found = nearest_to_axes(centers, turns[:, :, 2])
     if found is None:
         raise UserError("--holdout sector needs cameras that look at one place; take --holdout block")
     flat = (centers - found[0]) @ from_above(up_of(turns)).T
     angles = np.round(np.degrees(np.arctan2(flat[:, 1], flat[:, 0])), _ROUNDED) % 360
-    around, count = np.sort(angles), len(cameras)
-    ends = np.searchsorted(around, angles) + _eighth(count) - 1
-    widths = (around[ends % count] - angles) % 360
+    least = _SAME * float(np.median(np.linalg.norm(centers - found[0], axis=1)))
+    places = np.array([min(near) for near in cKDTree(centers).query_ball_point(centers, least)])
+    angles, count, around = angles[places], len(cameras), np.sort(angles[np.unique(places)])
+    ends = np.searchsorted(around, angles) + _eighth(len(around)) - 1
+    widths = (around[ends % len(around)] - angles) % 360
+    fits = widths <= _WIDE * np.median(widths[np.unique(places)])
+    twice, last = np.sort(np.concatenate([angles, angles + 360])), widths + 0.1**_ROUNDED / 2
+    sizes = np.searchsorted(twice, angles + last) - np.searchsorted(twice, angles)
+    few = fits & (sizes <= 2 * _eighth(count))
     by_name = np.roll(np.arange(count), -(count // 2))
-    first = by_name[(widths <= _WIDE * np.median(widths))[by_name].argmax()]
-    return np.flatnonzero((angles - angles[first]) % 360 <= widths[first] + 0.1**_ROUNDED / 2)
+    first = by_name[(few if few.any() else fits)[by_name].argmax()]
+    return np.flatnonzero((angles - angles[first]) % 360 <= last[first])
