@@ -61,11 +61,22 @@ def test_what_is_not_measured_stays():
     assert not Similarity.of(only, "here").upright and only["unit"] == "metre"
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_points_tell_it_in_any_unit(unit):
+    front = scene([[1.0, 0.3, 1.0], [3.0, -0.4, 1.0]])
+    record = measured_record(None, ABOVE, 1 / SCALE, scene(GROUND), front)
+    other = measured_record(None, unit * ABOVE, 1 / SCALE / unit, unit * scene(GROUND), unit * front)
+    np.testing.assert_allclose(other["rotation"], record["rotation"], atol=1e-9)
+    np.testing.assert_allclose(other["translation"], record["translation"], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("points", "fault"),
     [
         ({"front": np.eye(3)[:2]}, "what is up; click three points of the ground"),
         ({"ground": np.outer([0, 1, 2], [1, 1, 1.0])}, "lie on a line"),
+        ({"ground": np.zeros((3, 3))}, "lie on a line"),
+        ({"ground": GROUND * np.nan}, "lie on a line"),
         ({"ground": scene(GROUND), "front": scene([[0, 0, 0], [0, -3.0, 0]])}, "straight up"),
     ],
 )

@@ -8,6 +8,7 @@ import numpy as np
 from splatting.files.similarity import PLACE, Similarity
 from splatting.host.errors import UserError
 
+TINY = 1e-300  # instead of a length of 0
 _OF_GPS = "gps_photos", "gps_error", "scale_error"
 
 
@@ -29,8 +30,7 @@ def measured_record(
     known = Similarity.of(record, "orientation") if before else Similarity(np.eye(3), 1.0, np.zeros(3), upright=False)
     axes, origin = known.rotation, -known.rotation.T @ known.translation / known.scale
     if ground is not None:
-        down = np.cross(ground[1] - ground[0], ground[2] - ground[0])
-        down = _unit(down, "the three points of the ground lie on a line; choose others")
+        down = _unit(ground_normal(ground), "the three points of the ground lie on a line; choose others")
         down = -down if (above - ground[0]) @ down > 0 else down
         axes, origin = _level(axes, down), ground.mean(0)
         record["vertical"] = "three points of the ground"
@@ -39,6 +39,7 @@ def measured_record(
         if record["vertical"] is None:
             raise UserError("a front needs to know what is up; click three points of the ground, too")
         along = front[1] - front[0]
+        along /= np.linalg.norm(along).clip(TINY)
         right = _unit(along - (along @ axes[1]) * axes[1], "the front goes straight up; choose other points")
         axes = np.stack([right, axes[1], np.cross(right, axes[1])])
     if ground is not None or front is not None:
@@ -50,10 +51,17 @@ def measured_record(
     return record | {"rotation": axes.tolist(), "scale": scale, "translation": translation.tolist()}
 
 
+def ground_normal(ground: np.ndarray) -> np.ndarray:
+    """A normal (3,) of three points (3,3), as long as the triangle's least height in parts of its longest side."""
+    sides = np.roll(ground, 1, 0) - ground
+    longest = np.square(sides).sum(1).max()
+    return np.cross(sides[0], sides[1]) / longest.clip(TINY)
+
+
 def _unit(vector: np.ndarray, fault: str) -> np.ndarray:
-    """A vector (3,) at length 1. UserError with a fault if it has none."""
+    """A vector (3,) at length 1, if it is at least 1e-6 long. UserError with a fault if not, or if it is not finite."""
     length = np.linalg.norm(vector)
-    if length < 1e-9:
+    if not 1e-6 <= length < np.inf:
         raise UserError(fault)
     return vector / length
 
