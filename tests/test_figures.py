@@ -28,7 +28,8 @@ def curve(*rows: tuple) -> list[dict]:
 
 
 def runs_of(curves: dict) -> list[dict]:
-    return [{"apart": False, "config": config, "curve": rows, "views": {"test": 7}} for config, rows in curves.items()]
+    common = {"apart": False, "finished": True, "views": {"test": 7}}
+    return [common | {"config": config, "curve": rows} for config, rows in curves.items()]
 
 
 def points(axes, label: str) -> list:
@@ -45,19 +46,20 @@ def test_the_curve_of_a_training(tmp_path, drawn):
     """Each subset of the views has a line of its own, and whole sets beside it are hollow; the best and the end."""
     rows = curve(
         (0.5, 9.0, 0.5, 9.5, 0.5, 4), (1.0, 10.0, 0.75, 11.0, 0.875, 4), (1.0, 15.0, 0.75, None, 0.875),
-        (4.0, 12.0, 0.75, 18.0, 0.875, 4), (4.0, 14.0, 0.75, 20.0, 0.875),
+        (4.0, 12.0, 0.75, 18.0, 0.875, 4), (4.0, 14.0, 0.75, 20.5, 0.875),
     )  # fmt: skip
     draw_curve(tmp_path / "error_vs_time.png", rows, "a model", {"test": 7, "train": 6})
     upper, lower = drawn[0].axes
     assert upper.get_xscale() == lower.get_xscale() == lower.get_yscale() == "log"
     assert points(upper, "4 of 7 test views") == [[[0.5, 9], [1, 10], [4, 12]]]
     assert points(upper, "4 train views") == [[[0.5, 9.5], [1, 11], [4, 18]]]
-    assert points(upper, "all 7 test views") == [[[1, 15], [4, 14]]] and points(upper, "6 train views") == [[[4, 20]]]
+    assert points(upper, "all 7 test views") == [[[1, 15], [4, 14]]] and points(upper, "6 train views") == [[[4, 20.5]]]
     assert points(upper, "highest mean over all test views: 15.00 dB, iteration 3") == [[[1, 15]]]
-    assert hollow(upper) == [[[1, 15], [4, 14]], [[4, 20]]]
+    assert hollow(upper) == [[[1, 15], [4, 14]], [[4, 20.5]]]
     legends = [text.get_text() for axes in (upper, lower) for text in axes.get_legend().get_texts()]
-    assert "gap, 6 dB at the end, 4 of 7 test views" in legends
-    assert "gap, 0.125 at the end, 4 of 7 test views" in legends
+    assert "gap, 6.5 dB at the end" in legends and "gap, 0.125 at the end" in legends  # of all views
+    for axes in (upper, lower):
+        assert not axes.get_legend().get_window_extent().overlaps(axes.get_window_extent())
     draw_curve(tmp_path / "error_vs_time.png", [rows[2], rows[4]], "a model", {"test": 7, "train": 6})
     assert points(drawn[1].axes[0], "all 7 test views") == [[[1, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
 
@@ -83,7 +85,7 @@ def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
 
 
 def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
-    """But for the end of a line, which is the score. Other programs, which score all views, are told from them."""
+    """All views are apart from them, at the end, too. Other programs, which score all views, are told from them."""
     whole = [curve((9.0, 50.0, 0.99))[0] | {"iteration": 2}]
     curves = [curve((t, p, 0.8, None, None, n), (9.0, p + 1, 0.9, None, None, n)) for t, p, n in
               ((1.0, 20.0, 2), (2.0, 22.0, 2), (3.0, 24.0, 4))]  # fmt: skip
@@ -94,10 +96,23 @@ def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):
     draw_curves(tmp_path, "attic", [*runs_of({name: curves[i] for i, name in enumerate("ab")}), apart])
     assert drawn[4].legends[0].get_title().get_text().startswith("2 of ")
     same, mixed = drawn[0].axes[0], drawn[2].axes[0]
-    assert points(same, "b") == [[[2.0, 22.0], [9.0, 50.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
+    assert points(same, "b") == [[[2.0, 22.0], [9.0, 23.0]]] and hollow(same) == [[[9.0, 50.0]]] * 2
     said = [figure.legends[0].get_title().get_text().splitlines()[0] for figure in drawn[:4:2]]
-    assert said == ["2 of 7 test views; hollow, other programs and the end: all of them", "all 7 test views"]
+    assert said == ["2 of 7 test views; hollow and other programs: all of them", "all 7 test views"]
     assert [points(mixed, name) for name in "abc"] == [[[[9.0, 50.0]]]] * 3 and not hollow(mixed)
+
+
+def test_seeds_are_a_mean_and_a_band_where_they_are_alike_and_an_unfinished_training_is_told(tmp_path, drawn):
+    first, second, short = (curve(*rows) for rows in ([(1, 20), (4, 30)], [(3, 22), (6, 33)], [(1, 21)]))
+    several = runs_of({"a": first}) + runs_of({"a": second})
+    draw_curves(tmp_path, "attic", [*several, *(run | {"config": "b"} for run in several[:1])])
+    draw_curves(tmp_path, "attic", [*several, *(run | {"finished": False, "curve": short} for run in several[:1])])
+    alike, other = drawn[0], drawn[2]
+    (band,) = alike.axes[0].collections
+    assert points(alike.axes[0], "a") == [[[2, 21], [5, 31.5]]]
+    assert {tuple(place) for place in band.get_paths()[0].vertices} >= {(2, 20), (2, 22), (5, 30), (5, 33)}
+    assert alike.legends[0].get_title().get_text().endswith("\nmean of the seeds, band: all of them")
+    assert points(other.axes[0], "a (not finished)") == [[[1, 21]]]
 
 
 def test_psnr_against_size_has_a_line_for_sets_that_differ_in_their_last_word(tmp_path, drawn):
@@ -113,7 +128,13 @@ def test_psnr_against_size_has_a_line_for_sets_that_differ_in_their_last_word(tm
     assert points(axes, "adc") == [[[0.9, 29.0], [2.0, 30.0]]] and points(axes, "mcmc") == [[[1.0, 29.5]]]
     assert [text.get_text() for text in drawn[0].legends[0].get_texts()] == ["adc", "mcmc", "budget"]
     assert sum(len(line.get_xdata()) for line in axes.lines) == 5
-    assert draw_sizes(tmp_path, "attic", runs[:1]) == draw_sizes(tmp_path, "attic", runs[-1:]) == []
+    equal = [run | {"iterations": {"7": {"PSNR": 30.0, "gaussians": 1000 + i}}} for i, run in enumerate(runs[:3])]
+    assert (
+        draw_sizes(tmp_path, "attic", equal)
+        == draw_sizes(tmp_path, "attic", runs[:1])
+        == draw_sizes(tmp_path, "attic", runs[-1:])
+        == []
+    )
 
 
 def test_cameras_from_above_are_drawn_once_for_each_split(tmp_path, drawn):

@@ -15,6 +15,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from splatting.evaluation.error_curve import SUBSET, Row, best_test, common_subset, read_curve, rows_on, whole_sets
@@ -31,6 +32,7 @@ PEER_MARKERS = "xs^vDP*"
 SECONDS = "seconds of training"
 PANEL, DPI, FONT = (5.6, 4.2), 140, 12  # of a report's figure: inches, and letters to be read at half the size, too
 HOLLOW = {"linestyle": ":", "linewidth": 1, "markerfacecolor": "white", "zorder": 3}  # whole sets beside a subset
+SAME = 1.02  # times as many Gaussians, or fewer, are the same number
 LEGEND = 72  # letters in a line of a legend
 
 Value = Callable[[Row, str], float | None]
@@ -51,12 +53,6 @@ def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
     """Seconds and values of the rows that have them; the axis of the seconds is logarithmic."""
     pairs = ((row["seconds"], value(row, views)) for row in rows)
     return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
-
-
-def _scored_at_end(rows: Sequence[Row], subset: int | None) -> list[Row]:
-    """The rows on a subset, the last one in favour of that on whole sets, which is the score."""
-    line, end = rows_on(rows, subset), whole_sets(rows[-1:])
-    return [row for row in line if row["iteration"] != end[0]["iteration"]] + end if end else line
 
 
 def _draw(axes: Axes, points: Sequence[Point], label: str | None, **style: Any) -> None:
@@ -130,15 +126,9 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
                 points = _points(rows_on(rows, subset), value, name)
                 label = _views_text(subset, views[name], name) if points or subset is None else None
                 _draw(axes, points, label, **{"marker": "o", "markersize": 4, "color": color} | style)
-        both = [
-            row
-            for row in rows_on(rows, main)
-            if row["seconds"] > 0 and None not in [value(row, name) for name in COLORS]
-        ]
-        ends = [[value(row, name) for row in both] for name in COLORS]
-        which = "" if main is None else f", {_views_text(main, views['test'])}"
-        label = f"gap, {abs(ends[1][-1] - ends[0][-1]):.3g}{unit} at the end{which}" if len(both) > 1 else None
-        axes.fill_between([row["seconds"] for row in both], *ends, color="gray", alpha=0.2, linewidth=0, label=label)
+        scored = [row for row in rows if row["seconds"] > 0 and None not in [value(row, name) for name in COLORS]]
+        both = rows_on(scored, main)
+        _shade_gap(axes, both, scored[-1:] or both, value, unit, views["test"])
     if len(whole_sets(rows)) > 1 and (best := best_test(rows)):
         label = f"highest mean over all test views: {best['test_psnr']:.2f} dB, iteration {best['iteration']:,}"
         _draw(
@@ -147,8 +137,18 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
     _label(upper, "", "PSNR (dB)")
     _label(lower, "seconds of training, without scoring and saving", "1 - SSIM", log=True)
     for axes in (upper, lower):
-        axes.legend()
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
     _save(figure, path)
+
+
+def _shade_gap(axes: Axes, rows: Sequence[Row], end: Sequence[Row], value: Value, unit: str, views: int) -> None:
+    """Shade the gap between test and train views at rows of both, and tell that of the last row, `end`."""
+    lines, label = [[value(row, name) for row in rows] for name in COLORS], None
+    if len(rows) > 1:
+        test, train = (value(end[0], name) for name in COLORS)
+        which = "" if end[0][SUBSET] is None else f", {_views_text(int(end[0][SUBSET]), views)}"
+        label = f"gap, {abs(train - test):.3g}{unit} at the end{which}"
+    axes.fill_between([row["seconds"] for row in rows], *lines, color="gray", alpha=0.2, linewidth=0, label=label)
 
 
 def _panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Callable[[Axes], str | None]) -> Path:
@@ -177,17 +177,17 @@ def draw_curves(
 ) -> list[Path]:
     """Draw a scene's test PSNR and 1 - SSIM against seconds of training; return the files, none if no run has a curve.
 
-    Each option set has a colour and each seed a line, which the legend says. Lines are of the views on which all runs
-    compare; if these are a subset, hollow points beside them score all, and so does the end of a line. With one option
-    set, the training views are drawn too, dashed. peers: curves of other programs, in grey.
+    Each option set has a colour, and a line with a band for its seeds (`_draw_seeds`). Lines are of the views on which
+    all runs compare; if these are a subset, hollow points apart from them score all. With one option set, the training
+    views are drawn too, dashed. peers: curves of other programs, in grey.
     """
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     several = len({run["config"] for run in runs}) > 1
     counts = {run["views"]["test"] for run in runs}
     subset = common_subset(run["curve"] for run in runs if not run["apart"])
     said = _views_text(subset, counts.pop() if len(counts) == 1 else None)
-    said += "" if subset is None else f"; hollow{', other programs' if peers else ''} and the end: all of them"
-    said += "\na line for each seed" if len(runs) > len({run["config"] for run in runs}) else ""
+    said += "" if subset is None else f"; hollow{' and other programs' if peers else ''}: all of them"
+    said += _about_seeds(runs, subset)
 
     def draw(axes: Axes, value: Value) -> str:
         _draw_runs(axes, runs, value, several, subset)
@@ -202,8 +202,19 @@ def draw_curves(
     ]
 
 
+def _about_seeds(runs: Sequence[dict[str, Any]], subset: int | None) -> str:
+    """Say how the seeds of option sets are drawn; empty without several."""
+    curves: dict[str, list[Sequence[Row]]] = {}
+    for run in runs:
+        curves.setdefault(run["config"], []).append(rows_on(run["curve"], subset))
+    several = [of_set for of_set in curves.values() if len(of_set) > 1]
+    if not several:
+        return ""
+    return "\nmean of the seeds, band: all of them" if all(map(_are_alike, several)) else "\na line for each seed"
+
+
 def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
-    """Draw test PSNR against the number of Gaussians trained; return the file, none for fewer than two option sets.
+    """Draw test PSNR against the number of Gaussians trained; return the file, none where the number is the same.
 
     Sets whose names agree but for a number at their end, as adc-100k and adc-1M, are joined by a line for each seed.
     """
@@ -223,7 +234,8 @@ def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
             _draw(axes, sorted(points), None if again else name, **style)
 
     labels = "thousands of Gaussians", "PSNR of the test views (dB)"
-    several = lines and len({run["config"] for run in runs}) > 1
+    counts = [count for points in lines.values() for count, _ in points]
+    several = lines and len({run["config"] for run in runs}) > 1 and max(counts) > SAME * min(counts)
     return [_panel(folder / f"{scene}_size.png", scene, False, labels, draw)] if several else []
 
 
@@ -264,24 +276,51 @@ def draw_cameras(folder: Path, scene: str, splits: Mapping[str, Sequence[Any]]) 
 
 
 def _draw_runs(axes: Axes, runs: Sequence[dict[str, Any]], value: Value, several: bool, subset: int | None) -> None:
-    """Draw a line for each run."""
-    configs = list(dict.fromkeys(run["config"] for run in runs))
+    """Draw a line for each option set, or for each of its runs (`_draw_seeds`), and whole sets beside a subset."""
+    sets: dict[tuple[Any, bool], list[dict[str, Any]]] = {}
     for run in runs:
-        index = configs.index(run["config"])
-        first = run is next(other for other in runs if other["config"] == run["config"])
-        name = run["config"] or ("no option set" if several else "test views")
-        name += " (other ground truth)" if run["apart"] else ""
+        sets.setdefault((run["config"], run["finished"]), []).append(run)
+    configs = list(dict.fromkeys(config for config, _ in sets))
+    for (config, is_finished), members in sets.items():
+        index = configs.index(config)
+        name = config or ("no option set" if several else "test views")
+        name += " (other ground truth)" if members[0]["apart"] else ""
+        name += "" if is_finished else " (not finished)"
         style = {"color": f"C{index % 10}", "linestyle": STYLES[index // 10 % len(STYLES)], "linewidth": 1.2}
-        style |= {"marker": "o", "markersize": 3.5, "alpha": 0.4 if run["apart"] else 1.0}
-        line = _scored_at_end(run["curve"], subset)
-        _draw(axes, _points(line, value, "test"), name if first else None, **style)
+        style |= {
+            "marker": "o" if is_finished else "x",
+            "markersize": 3.5,
+            "alpha": 0.4 if members[0]["apart"] else 1.0,
+        }
+        curves = [rows_on(run["curve"], subset) for run in members]
+        _draw_seeds(axes, curves, value, "test", name, style)
         if subset is not None:
-            _draw(axes, _points(whole_sets(run["curve"]), value, "test"), None, **style | HOLLOW)
-        if not several:
+            for run in members:
+                _draw(axes, _points(whole_sets(run["curve"]), value, "test"), None, **style | HOLLOW)
+        if not several and max(len(_points(rows, value, "train")) for rows in curves) > 1:
             dashed = style | {"marker": "", "linestyle": "--", "alpha": 0.6}
-            of_train = _points(line, value, "train")
-            if len(of_train) > 1:
-                _draw(axes, of_train, "training views" if first else None, **dashed)
+            _draw_seeds(axes, curves, value, "train", "training views", dashed)
+
+
+def _are_alike(curves: Sequence[Sequence[Row]]) -> bool:
+    """Tell whether several curves have the same iterations, at which their means are known."""
+    return len(curves) > 1 and len({tuple(row["iteration"] for row in rows) for rows in curves}) == 1
+
+
+def _draw_seeds(
+    axes: Axes, curves: Sequence[Sequence[Row]], value: Value, views: str, name: str, style: dict[str, Any]
+) -> None:
+    """Draw the mean of curves that are alike, and a band from the lowest to the highest; a line for each of others."""
+    lines = [_points(rows, value, views) for rows in curves]
+    if _are_alike(curves) and len({*map(len, lines)}) == 1:
+        columns = [[*zip(*points, strict=True)] for points in zip(*lines, strict=True)]
+        seconds, values = [fmean(x) for x, _ in columns], [y for _, y in columns]
+        axes.fill_between(
+            seconds, [*map(min, values)], [*map(max, values)], color=style["color"], alpha=0.2, linewidth=0
+        )
+        lines = [[*zip(seconds, map(fmean, values), strict=True)]]
+    for number, points in enumerate(lines):
+        _draw(axes, points, None if number else name, **style)
 
 
 def _draw_peers(axes: Axes, peers: Sequence[dict[str, Any]], value: Value) -> None:
