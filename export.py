@@ -263,7 +263,7 @@ def _check_views(
     A warning if the views are not those of the training.
     """
     from splatting.camera_paths.poses import poses_of  # SciPy takes a while to import
-    from splatting.exports.page_start import named
+    from splatting.exports.page_start import check_note, named
 
     if not args.ply:
         warn_if_moved(args.model_path, cameras)
@@ -271,7 +271,7 @@ def _check_views(
     if args.start is not None:
         named(args.start, names, f"--start {args.start}")
     for note in read_notes(args.notes).views if args.notes else ():
-        named(note.camera, names, f"--notes: {note.camera}")
+        check_note(note, cameras)
     if make_path and cameras:
         make_path(poses_of(cameras))
 

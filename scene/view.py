@@ -39,8 +39,8 @@ class View:
     pinhole. world_view_transform, projection_matrix, full_proj_transform: (4,4) float32, transposed; camera_center (3,)
     float32; all on `device`, made when they are first read. columns: the columns that count in loss and scores, None:
     all. exposure_name: the photo's name among the trained exposures where it is not image_name, else None.
-    pictures: paths of further ones, by names of parts, which are decoded at training size (`picture`).
-    depth_has_gaps: whether an inverse depth of 0 is unknown, and not far away.
+    photo_size: (width, height) of its file. pictures: paths of further ones, by names of parts, which are decoded at
+    training size (`picture`). depth_has_gaps: whether an inverse depth of 0 is unknown, and not far away.
     """
 
     has_dataset_pictures = True  # whether no other code has assigned or changed them (scene/cameras.py)
@@ -56,6 +56,7 @@ class View:
         self.image_path = Path(info.image_path) if info.image_path else None
         self.columns = columns
         self.image_width, self.image_height = self._size = size
+        self.photo_size = info.file_size or (info.width, info.height)
         self.fx, self.fy = fov2focal(info.FovX, size[0]), fov2focal(info.FovY, size[1])
         offset = 2 * info.cx / info.width - 1, 2 * info.cy / info.height - 1
         self.cx, self.cy = ((off + 1) * pixels / 2 for off, pixels in zip(offset, size, strict=True))

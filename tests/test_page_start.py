@@ -18,7 +18,7 @@ from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
 from splatting.camera_paths import without_scene
 from splatting.camera_paths.poses import Poses, poses_of
-from splatting.camera_paths.start import LEAST, best_start, narrowed
+from splatting.camera_paths.start import LEAST, MOST, best_start, narrowed
 from splatting.exports import cleaning
 from splatting.exports.formats import Around, format_of
 from splatting.exports.page_start import PICTURE, named, write_preview
@@ -51,11 +51,23 @@ def test_a_start_is_named_with_or_without_its_ending():
         named("photo", names, "--start photo")
 
 
-def test_a_photo_fills_the_width_of_a_window_unless_that_is_very_wide():
-    fov = math.radians(40)
-    assert narrowed(fov, 1.5, 1.5) == narrowed(fov, 1.5, 0.5) == pytest.approx(fov)
-    assert math.tan(narrowed(fov, 1.5, 1.6) / 2) * 1.6 == pytest.approx(math.tan(fov / 2) * 1.5)
-    assert math.tan(narrowed(fov, 0.5, 2.0) / 2) == pytest.approx(LEAST * math.tan(fov / 2))
+@pytest.mark.parametrize(
+    ("photo", "window", "heights"),
+    [
+        (1.5, 1.5, 1),
+        (1.5, 1.6, 1.5 / 1.6),  # fills the width
+        (0.5, 2.0, LEAST),
+        (1.5, 1.3, 1),  # fills the height
+        (1.5, 0.75, LEAST * 2),
+        (1.5, 390 / 844, MOST),  # a phone
+        (0.75, 390 / 844, LEAST * 0.75 * 844 / 390),
+        (0.4, 0.5, LEAST),
+    ],
+)
+def test_a_photo_fills_a_window_unless_that_hides_much_of_it(photo, window, heights):
+    assert math.tan(narrowed(math.radians(40), photo, window) / 2) == pytest.approx(
+        heights * math.tan(math.radians(20))
+    )
 
 
 def test_the_picture_beside_a_link_is_the_first_one(tmp_path):

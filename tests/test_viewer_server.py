@@ -22,7 +22,7 @@ from websockets.exceptions import InvalidStatus  # noqa: E402
 
 from scene import Scene  # noqa: E402
 from scene.with_splats import model_of  # noqa: E402
-from splatting.camera_paths.start import LEAST  # noqa: E402
+from splatting.camera_paths.start import LEAST, MOST  # noqa: E402
 from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
 from splatting.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
 from splatting.viewer import server as servers  # noqa: E402
@@ -292,14 +292,13 @@ def test_a_browser_begins_with_most_of_a_photos_height_in_windows_of_any_shape(p
     place, photo = camera_center(camera.R, camera.T), math.tan(camera.FoVy / 2)
     with Client(page.url) as client:
         client.look(size=(96, 64))  # at the browser's own beginning, before it hears of the page's
-        for size in ((956, 300), (390, 844), (96, 64)):
+        for size, heights in (((956, 300), LEAST), ((390, 844), MOST), ((96, 64), 1)):
             client.look(place, wxyz, size=size)
-            height = math.tan(_fov(client) / 2) / photo
-            assert height == pytest.approx(max(min(1, 1.5 * size[1] / size[0]), LEAST), rel=1e-3)
+            assert math.tan(_fov(client) / 2) / photo == pytest.approx(heights, rel=1e-3)
         client.look(place, wxyz, fov=0.3)  # the same window: what somebody has set stays
         client.look(place + 1.0, wxyz, size=(500, 100))  # not where it began
         client.look(place, wxyz, size=(50, 100))
-        assert math.tan(_fov(client) / 2) / photo == pytest.approx(1, rel=1e-3)
+        assert math.tan(_fov(client) / 2) / photo == pytest.approx(MOST, rel=1e-3)
 
 
 def test_the_line_between_photo_and_render_is_dragged_where_both_are_shown(page):
@@ -407,11 +406,27 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
         click("The ground", (0, 1, 2))
         assert "tilted by 0." in tab.says.content
         click("The front", (2, 1))
+        click("A note", (3,))  # in the middle of the nearest photo that shows it, a little above
+        camera = page.measure._cameras.by_name["train 0: around 0"]
+        assert f"camera: {camera.image_name}\n    at: 480 " in tab.says.content
         _set(client, tab.keep, True)
         wait_for(lambda: (tmp_path / "scene/orientation.json").is_file() and "5 m" in tab.says.content)
         assert client.until("NotificationShowMessage")["props"]["title"] == "Set right"
+        record = read_orientation(tmp_path / "scene")
+        for ground, said in (
+            ([[0, 0, 0], [1, 0.0, 0], [0.5, 0.01, 0.1]], "as its points lie nearly on a line"),
+            ([[0, 0, 0], [1, 0.2, 0], [0.0, 0.0, 1.0]], "as it is tilted by 11 degrees in the photos"),
+        ):
+            for point in ground:
+                tab.add("The ground", np.array(point))
+            with pytest.raises(UserError, match=f"{said}; click others, or press “Set right” again"):
+                tab.write()
+            tab.write()
+            assert read_orientation(tmp_path / "scene") != record
+            _set(client, tab.back, True)
+            wait_for(lambda: read_orientation(tmp_path / "scene") == record)
+            assert client.until("NotificationShowMessage")["props"]["title"] == "As before"
     page.stop()
-    record = read_orientation(tmp_path / "scene")
     assert recorded_similarity(str(tmp_path / "out"), "")["similarity"] == record
     found = Similarity.of(record, "here").from_local(np.array([10.0, 0, 0]))
     assert found.metric and found.scale == pytest.approx(2.5, rel=1e-2)
@@ -432,6 +447,18 @@ def test_what_is_measured_spares_another_orientation_of_the_scene(tmp_path):
     for where, content in (("model.json", {"similarity": record | {"scale": 3.0}}), ("orientation.json", record)):
         (tmp_path / where).write_text(json.dumps(content))
     place = Place(tmp_path, str(tmp_path), (0.0, 0.0, 0.0))
-    assert place.write(record | {"scale": 4.0}) == [tmp_path / "model.json"]
+    for scale in (5.0, 4.0):
+        assert place.write(record | {"scale": scale}) == [tmp_path / "model.json"]
     assert json.loads((tmp_path / "orientation.json").read_text()) == record
     assert json.loads((tmp_path / "model.json").read_text())["similarity"]["scale"] == 4
+    for scale in (5, 3):
+        assert place.restore() == [tmp_path / "model.json"] and place.record["scale"] == scale
+    assert json.loads((tmp_path / "model.json").read_text()) == {"similarity": record | {"scale": 3}}
+    (tmp_path / "model.json").write_text("{}")
+    (tmp_path / "orientation.json").unlink()
+    place = Place(tmp_path, str(tmp_path), (0.0, 0.0, 0.0))
+    place.write(record)
+    (tmp_path / "model.json").write_text(json.dumps({"similarity": record, "antialiasing": True}))  # by a training
+    place.restore()
+    assert not (tmp_path / "orientation.json").exists() and place.record is None
+    assert json.loads((tmp_path / "model.json").read_text()) == {"antialiasing": True}

@@ -1,6 +1,7 @@
 """What guests of a page stop at: its octree, read as its form is described, and where a floor and walls are."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -56,6 +57,15 @@ def test_a_room_is_solid_at_its_walls_floor_and_step_alone():
     free = [*around, (0, 0.1, 0), (0, STEP[0] + 0.1, 2), (HALF - 0.15, 1, 0)]
     full = [(0, -0.05, 0), (0, STEP[0] - 0.07, 2), (HALF + 0.07, 1, 0), (-HALF - 0.07, 1, 0), (0, HIGH + 0.07, -1)]
     assert solid_at(solid, np.array([*free, *full])) == [False] * len(free) + [True] * len(full)
+
+
+def test_nobody_walks_where_photos_show_a_small_thing(capsys):
+    small = Similarity(np.eye(3), 0.5, np.zeros(3))  # 3 metres wide
+    assert solid_of(moved_splats(room(), small), cameras(unit=0.5), pipeline()) is None
+    said = capsys.readouterr().out
+    assert re.search(
+        r"the photos show 3\.\d x 3\.\d metres, too small to walk in; guests can walk in 5 x 5 or more", said
+    )
 
 
 def test_cameras_of_an_unknown_unit_stand_at_the_height_of_eyes():

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from diff_gaussian_rasterization.reference.lens import rays
 
 from scene.cameras import Camera
 from scene.readers.start_cloud import nearest_to_axes
@@ -76,6 +77,21 @@ def opening(camera: Camera) -> float:
     lens = getattr(camera, "lens", None)
     wide = lens is not None and lens.chart != "perspective"
     return min(float(camera.FoVy), np.radians(WIDEST)) if wide else float(camera.FoVy)
+
+
+def ray_through(camera: Camera, x: float, y: float) -> np.ndarray:
+    """The direction (3,) in the world of a place in a camera's photo: pixels from the left and the top of its file.
+
+    It has no certain length, and is 0 where the lens shows nothing.
+    """
+    size = np.array([camera.image_width, camera.image_height])
+    share = np.array([x, y]) / getattr(camera, "photo_size", size)
+    if lens := getattr(camera, "lens", None):
+        alone = lens._replace(center=tuple((lens.center - share * size + 0.5).tolist()))  # in an image of one pixel
+        return poses_of([camera]).turns[0] @ rays(alone, 1, 1)[0, 0].numpy()
+    full = camera.full_proj_transform.double().cpu().numpy()[:3]
+    ray = np.cross(*(full[:, :2] - full[:, 3:] * (2 * share - 1)).T)
+    return ray * np.sign(ray @ full[:, 3])
 
 
 def unit(vector: np.ndarray) -> np.ndarray:

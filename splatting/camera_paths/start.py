@@ -6,7 +6,7 @@ import numpy as np
 
 from splatting.camera_paths.poses import Poses, focus_point
 
-LEAST = 0.85  # of a photo's height that is shown, however wide the window is
+LEAST, MOST = 0.85, 2.0  # of a photo's sides that is shown, whatever the window's shape; of its height, at most
 _ALIKE = 1e-3  # scores that differ by less are equal
 _FARTHER = 1.5  # of the usual distance: from there a view shows more of the middle, and no less well
 
@@ -28,8 +28,11 @@ def best_start(poses: Poses) -> int:
 
 
 def narrowed(fov: float, photo: float, window: float) -> float:
-    """The vertical opening angle, radians, at which a photo fills a window's width, and LEAST of its height is shown.
+    """The vertical opening angle, radians, at which a photo fills a window, and LEAST of its sides is shown.
 
-    fov: of the photo. photo, window: width over height. page.js has the same formula.
+    The window shows MOST photos' heights at most. fov: of the photo. photo, window: width over height. page.js has the
+    same formula.
     """
-    return 2 * math.atan(math.tan(fov / 2) * max(min(1.0, photo / window), LEAST))
+    share = photo / window
+    heights = max(share, LEAST) if share < 1 else min(max(1.0, LEAST * share), MOST)
+    return 2 * math.atan(math.tan(fov / 2) * heights)

@@ -112,7 +112,8 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None
         start = best_start(poses_of(around.cameras)) if names else 0
     picture = _picture_of(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
-    write_html(path, splats, around.cameras, *how, around.upright, around.metric, notes, solid, around.once)
+    how = *how, around.upright, around.metric, notes, solid, around.pipe, around.once
+    write_html(path, splats, around.cameras, *how)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 

@@ -4,6 +4,7 @@ The viewer's axes are x right, y up, z backwards, and its camera has no roll, so
 of its settings is that of its settings.json, version 2 (docs/api.md and dist/settings.d.ts of the npm package).
 """
 
+import argparse
 import base64
 import gzip
 import io
@@ -18,11 +19,15 @@ import jinja2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gaussian_renderer.free_view import free_view
+from gaussian_renderer.median_depth import median_at
 from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
 from scene.splats.ply import packed_ply
-from scene.splats.splats import Splats, opacities, rotated
+from scene.splats.splats import Splats, rotated
+from scene.with_splats import model_of
 from splatting.camera_paths.keyframes import TimedPath
-from splatting.camera_paths.poses import Poses, focus_point, poses_of
+from splatting.camera_paths.poses import Poses, facing, focus_point, keyframe, poses_of, ray_through, unit
 from splatting.exports.notes import Note, Notes
 from splatting.exports.page_start import named
 from splatting.exports.vendor import FOLDER, RECORD, VIEWER
@@ -39,13 +44,13 @@ _MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
 BOOKMARKS = 10  # where no notes say which
 _TITLE = 60  # letters of their titles, as the viewer has it
 _ASIDE, _UNDER = 0.5, 0.25  # of the usual depth, by which guests may leave the cameras' box, sideways and down
-_MIDDLE = 0.05  # of the depth, around a camera's axis
 _USUAL_DEPTH = 2.0  # metres from a camera to what it looks at, where nothing tells the scale
 SOLID = "model:/solid.voxel.json"  # where the viewer asks for what is solid; page.js answers
 _KEYS_A_SECOND = 10
 _MOST_KEYS = 1000
 _VIEWER_AXES = np.diag([-1.0, -1.0, 1.0])  # the viewer turns each model by half a turn about z
 _TEXTS = {"css": "viewer.css", "licence": "LICENSE"}
+_PLAIN = argparse.Namespace(convert_SHs_python=False, compute_cov3D_python=False, debug=False)
 _OFF = {"enabled": False}
 _NO_EFFECTS = {  # the viewer's post effects
     "sharpness": {**_OFF, "amount": 0},
@@ -69,6 +74,7 @@ def write_html(
     metric: bool = False,
     notes: Notes | None = None,
     solid: "Solid | None" = None,
+    pipe: argparse.Namespace = _PLAIN,
     once: Callable[..., str] = lambda _, make, *given: make(*given),
 ) -> None:
     """Write the page, whole or not at all.
@@ -79,21 +85,20 @@ def write_html(
     of the notes, or the file's name. start: which camera the page begins at. picture: address of an image that is shown
     beside a link to the page; empty: none. upright: whether up is UP already; if not, it is found by the cameras.
     metric: whether a unit is a metre; if not, a headset shows the model as if photos were taken from two metres. solid:
-    what guests stop at when they walk, in the viewer's axes; None: they cannot walk. once: calls what makes the packed
-    model, or gives that of a page before (`Around.once`). UserError without a camera, or where notes name one that is
-    not there.
+    what guests stop at, in the viewer's axes; None: they cannot walk. pipe: pipeline options, by which notes find the
+    surface. once: calls what makes the packed model, or gives that of a page before. UserError without a camera.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
     poses = poses_of(cameras)
-    turn = np.eye(3) if upright else turn_upright(up_of(poses))
-    names = [str(camera.image_name) for camera in cameras]
+    turn, names = np.eye(3) if upright else turn_upright(up_of(poses)), [str(camera.image_name) for camera in cameras]
+    # Of the Gaussians from the page's first camera, median.
     camera_path = make_path(poses) if make_path else None
-    # The median distance of the Gaussians from the page's first camera.
     distance = float(np.median(np.linalg.norm(splats.means - poses.positions[start], axis=1))) if len(splats) else 1.0
-    aspects = [camera.image_width / camera.image_height for camera in cameras]
-    ahead = partial(_ahead, splats, poses)
-    notes, depth = notes or Notes(), float(np.median(_depths(poses, focus_point(poses), distance)))
+    notes, aspects = notes or Notes(), [camera.image_width / camera.image_height for camera in cameras]
+    pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": splats.antialiasing}))
+    depth = float(np.median(_depths(poses, focus_point(poses), distance)))
+    thing = partial(_thing, model_of(splats), cameras, pipe) if notes.views else None
     page = {
         "antialiasing": splats.antialiasing,
         "aspect": aspects[start],
@@ -101,15 +106,14 @@ def write_html(
         "limits": limits(poses, _VIEWER_AXES @ turn, depth),
         "metre": 1.0 if metric else depth / _USUAL_DEPTH,
         "solid": solid and {"address": SOLID, "about": solid.about},
-        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects, notes.views, ahead),
+        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects, notes.views, thing),
     }
     content = _template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
         model=once("packed", lambda: _packed_model(rotated(splats, turn))),
         notes=notes,
-        # No text in the JSON may end the script element that it stands in.
         picture=picture,
-        page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),
+        page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),  # no text in it may end its script element
         solid=_in_base64(gzip.compress(solid.content, mtime=0)) if solid else "",
         title=(notes.title or Path(path).stem) if title is None else title,
     )
@@ -174,14 +178,15 @@ def settings(
     start: int = 0,
     aspects: Sequence[float] | None = None,
     notes: Sequence[Note] = (),
-    ahead: Callable[[int], float | None] = lambda _: None,
+    thing: Callable[[Note, int, float], np.ndarray] | None = None,
 ) -> dict[str, Any]:
     """The settings of a model that was turned by `turn` (3,3).
 
     poses, names: of the training cameras before that. path: the animation, in the same frame. background: RGB in [0,1].
     distance: of the model, about which cameras that are all in one place turn. start: which camera the viewer begins
     at. aspects: width over height of the photos; None: all are square. notes: the bookmarks; none: BOOKMARKS cameras.
-    ahead: how far away a camera sees the thing in its middle, None: not known. Opening angles are vertical, in degrees.
+    thing: the point that a note means, of a camera with that index and usual depth. Opening angles are vertical, in
+    degrees.
     """
     aspects = aspects or [1.0] * len(poses)
     axes = _VIEWER_AXES @ turn
@@ -195,9 +200,8 @@ def settings(
         marked = [(n, f"View {place} of {len(chosen)}", "") for place, n in enumerate(chosen, 1)]
     marks = [_bookmark(title, text, cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n, title, text in marked]
     if notes:  # stand at the things, where the viewer shows their texts
-        for mark, (n, _, _) in zip(marks, marked, strict=True):
-            thing = poses.positions[n] + (ahead(n) or depths[n]) * poses.forward[n]
-            mark["position"] = (axes @ thing).tolist()
+        for mark, note, (n, _, _) in zip(marks, notes, marked, strict=True):
+            mark["position"] = (axes @ thing(note, n, depths[n])).tolist()
     return {
         "version": 2,
         "tonemapping": "none",
@@ -219,13 +223,17 @@ def _depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarr
     return np.where(ahead > 0, ahead, np.median(ahead))
 
 
-def _ahead(splats: Splats, poses: Poses, camera: int) -> float | None:
-    """How far away opaque Gaussians begin in the middle of a camera's view; None without any."""
-    offsets = splats.means - poses.positions[camera]
-    depths = offsets @ poses.forward[camera]
-    aside = np.linalg.norm(offsets - depths[:, None] * poses.forward[camera], axis=1)
-    found = depths[(depths > 0) & (aside < _MIDDLE * depths) & (opacities(splats) > 0.5)]
-    return float(np.quantile(found, 0.25)) if len(found) else None
+def _thing(
+    gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, note: Note, row: int, usual: float
+) -> np.ndarray:
+    """The point (3,) that a note of a camera means: on the surface, or as far away as is usual where there is none."""
+    camera, pose = cameras[row], poses_of([cameras[row]])
+    ray = ray_through(camera, *note.at) if note.at else np.zeros(3)
+    ray = unit(ray) if ray.any() else pose.forward[0]
+    key = keyframe(0.0, pose.positions[0], facing(ray, -pose.turns[0, :, 1]), pose.fov[0])
+    size = camera.image_width | 1, camera.image_height | 1  # so that the ray is in the middle of a pixel
+    view = free_view(*size, np.radians(key.fov), key.position, key.wxyz, gaussians.get_xyz.device)
+    return pose.positions[0] + (median_at(view, gaussians, pipe, size[0] // 2, size[1] // 2) or usual) * ray
 
 
 def limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:

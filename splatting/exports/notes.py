@@ -7,9 +7,11 @@
 
     ## The window
     camera: IMG_0012.jpg
+    at: 812 344
     Made in 1920.
 
-Facts are lines `name: value` right below the title, and a view's camera is the line below its name. The rest is text.
+Facts are lines `name: value` right below the title. A view's camera is the line below its name, and then a line may say
+where in that photo the thing is: pixels from the left and from the top. The rest is text.
 """
 
 import re
@@ -21,15 +23,20 @@ from splatting.host.errors import UserError
 _MOST = 25  # views, which the viewer takes
 _LONGEST_TEXT = 1000  # letters of a note, which the viewer shows in a box
 _NO_TEXT = re.compile(r"\s*([{<]|\[\s*[\[{\"])")  # JSON, RTF, HTML
+_AT = re.compile(r"at:\s*(\d+(?:\.\d*)?)[\s,x]+(\d+(?:\.\d*)?)", re.IGNORECASE)
 _FACT = re.compile(r"([^\W\d_][\w ]{0,30}):\s*(\S.*)")
 
 
 class Note(NamedTuple):
-    """A view with a name and a text. camera: the training photo that it is seen from."""
+    """A view with a name and a text. camera: the training photo that it is seen from.
+
+    at: x and y in pixels of that photo, of the thing that is meant; None: what is in its middle.
+    """
 
     name: str
     text: str
     camera: str
+    at: tuple[float, float] | None = None
 
 
 class Notes(NamedTuple):
@@ -61,10 +68,16 @@ def read_notes(path: str) -> Notes:
         camera = _FACT.fullmatch(lines[0].strip()) if lines else None
         if not name or camera is None or camera[1].lower() != "camera":
             raise UserError(f"--notes {path}: “{name}” has no camera; write a name after ##, and camera: PHOTO below")
-        words = "\n".join(lines[1:]).strip()
+        at, said = None, lines[1].strip() if len(lines) > 1 else ""
+        if re.match(r"at:\s*\d", said, re.IGNORECASE):
+            at = _AT.fullmatch(said)
+            if at is None:
+                raise UserError(f"--notes {path}: “{name}” is {said}; give two numbers of pixels, such as at: 812 344")
+            at = float(at[1]), float(at[2])
+        words = "\n".join(lines[1 if at is None else 2 :]).strip()
         if len(words) > _LONGEST_TEXT:
             raise UserError(f"--notes {path}: “{name}” has {len(words):,} letters; shorten it to {_LONGEST_TEXT:,}")
-        views.append(Note(name, words, camera[2]))
+        views.append(Note(name, words, camera[2], at))
     if len(views) > _MOST:
         raise UserError(f"--notes {path} has {len(views)} views, and a page takes {_MOST}; remove some")
     return Notes(title, facts, text, tuple(views))

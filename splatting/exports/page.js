@@ -13,22 +13,29 @@ const unpacked = (id) => {
 };
 
 // The viewer takes opening angles across the longer side of the window; the settings have vertical ones. A photo of
-// another aspect fills the window's width, as nobody has seen what is beside it, but most of its height is shown.
-const least = 0.85;
-const fit = (degrees, photo = Infinity) => {
-  const aspect = innerWidth / innerHeight, shown = Math.max(Math.min(1, photo / aspect), least);
-  return Math.atan(Math.tan(degrees * Math.PI / 360) * shown * Math.max(aspect, 1)) * 360 / Math.PI;
+// another aspect fills the window, as nobody has seen what is around it, but most of its height and width is shown:
+// the window has up to twice the photo's height.
+const least = 0.85, most = 2;
+const heights = (photo) => {
+  const share = photo / (innerWidth / innerHeight);
+  return share < 1 ? Math.max(share, least) : Math.min(Math.max(1, least * share), most);
+};
+const fit = (degrees, photo) => {
+  const longer = Math.max(innerWidth / innerHeight, 1);
+  return Math.atan(Math.tan(degrees * Math.PI / 360) * heights(photo) * longer) * 360 / Math.PI;
 };
 
-// Beside a photo that does not fill the window nobody saw much: the sides fade out until a guest moves.
+// Around a photo that does not fill the window nobody saw much: that fades out until a guest moves.
 const fadeSides = (photo) => {
   const sides = document.querySelector('.sse-sceneLayer').appendChild(document.createElement('div'));
   const color = getComputedStyle(document.body).backgroundColor;
   sides.style = 'position: absolute; inset: 0; pointer-events: none; transition: opacity 1s';
   const draw = () => {
-    const side = 50 * Math.max(1 - photo / least / (innerWidth / innerHeight), 0);
-    const clear = `transparent ${side}%, transparent ${100 - side}%`;
-    sides.style.background = side ? `linear-gradient(90deg, ${color}, ${clear}, ${color})` : 'none';
+    const height = heights(photo), width = height / photo * innerWidth / innerHeight;
+    sides.style.background = [[width, 90], [height, 0]].filter(([times]) => times > 1.001).map(([times, degrees]) => {
+      const side = 50 - 50 / times;
+      return `linear-gradient(${degrees}deg, ${color}, transparent ${side}%, transparent ${100 - side}%, ${color})`;
+    }).join() || 'none';
   };
   draw();
   addEventListener('resize', draw);
@@ -138,7 +145,7 @@ try {
   const { antialiasing, aspect, limits, metre, name, settings, solid } = JSON.parse(document.getElementById('page').textContent);
   for (const { initial } of settings.cameras) initial.fov = fit(initial.fov, aspect);
   for (const { camera: { initial }, extras } of settings.annotations) initial.fov = fit(initial.fov, extras.aspect);
-  for (const { keyframes: { values } } of settings.animTracks) values.fov = values.fov.map((degrees) => fit(degrees));
+  for (const { keyframes: { values } } of settings.animTracks) values.fov = values.fov.map((degrees) => fit(degrees, Math.max(aspect, innerWidth / innerHeight)));
   closeHelp();
   if (solid) answer(solid);
   const code = new Blob([await unpacked('viewer').text()], { type: 'text/javascript' });

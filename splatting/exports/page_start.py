@@ -15,6 +15,7 @@ from scene.splats.splats import Splats
 from scene.with_splats import model_of
 from splatting.camera_paths.poses import opening, poses_of
 from splatting.camera_paths.start import narrowed
+from splatting.exports.notes import Note
 from splatting.files.image_files import to_bytes
 from splatting.files.ours import write_picture
 from splatting.host.listing import some
@@ -30,6 +31,16 @@ def named(name: str, names: Sequence[str], said: str) -> int:
         if name in found:
             return found.index(name)
     raise UserError(f"{said} is no training photo; there are {some(names)}")
+
+
+def check_note(note: Note, cameras: Sequence[Camera]) -> None:
+    """UserError for a note that names no training photo, or a place outside of it."""
+    names = [str(camera.image_name) for camera in cameras]
+    width, height = cameras[named(note.camera, names, f"--notes: {note.camera}")].photo_size
+    x, y = note.at or (0, 0)
+    if x > width or y > height:
+        fault = f"is at {x:g} {y:g}, outside of {note.camera} with {width} x {height} pixels"
+        raise UserError(f"--notes: “{note.name}” {fault}; count pixels from its left and its top")
 
 
 @torch.no_grad()

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 EYES = 1.5  # metres above the floor, of the viewer's walkers
 VOXEL = 0.05  # metres
+LEAST = 5.0  # metres, of the sides of a place to walk in; the viewer asks it of all Gaussians, however far they are
 LEAF = 4  # voxels of a leaf's edge
 SOLID = 0xFF000000
 _LOW = 0.02  # part of what is opaque that lies under the floor
@@ -76,8 +77,11 @@ def metres_of(splats: Splats, cameras: Sequence[Camera]) -> float:
     return EYES / above
 
 
-def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Solid:
-    """The voxels of what the cameras see, and everywhere under it a floor with rails around. Metres, y down."""
+def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Solid | None:
+    """The voxels of what the cameras see, and everywhere under it a floor with rails around. Metres, y down.
+
+    None, with a line, for a place that is narrower than LEAST.
+    """
     volume = _volume(splats, cameras, pipe)
     voxels, surface = _solid_voxels(volume)
     level = int(np.quantile(voxels[surface, 1], 1 - _LOW))
@@ -85,8 +89,12 @@ def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace
     x, z = (np.arange(low[axis], high[axis] + 1) for axis in (0, 2))
     rail = np.arange(level - round(_RAIL / volume.voxel), level)
     floor = [x, level + np.arange(_THICK), z], [x[[0, -1]], rail, z], [x, rail, z[[0, -1]]]
-    across = " x ".join(f"{volume.voxel * len(side):.0f}" for side in (x, z))
-    print(f"--walk: a place of {across} metres; the viewer offers to walk from 5 x 5 on")
+    narrow = volume.voxel * min(len(x), len(z)) < LEAST
+    across = " x ".join(f"{volume.voxel * len(side):.1f}" for side in (x, z))
+    end = f", too small to walk in; guests can walk in {LEAST:g} x {LEAST:g} or more" * narrow
+    print(f"--walk: the photos show {across} metres{end}")
+    if narrow:
+        return None
     added = [np.stack(np.meshgrid(*ranges, indexing="ij"), -1).reshape(-1, 3) for ranges in floor]
     return octree(np.concatenate([voxels, *added]) @ _TURN.astype(np.int64), volume.voxel)
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from arguments import add_to_model_json
-from splatting.files.json_files import MODEL_JSON, write_json
-from splatting.files.measured import measured_record
+from splatting.files.json_files import MODEL_JSON, read_model_json, write_json
+from splatting.files.measured import ground_normal, measured_record
 from splatting.files.similarity import ENTRY, FILE, Similarity, read_orientation, recorded_similarity
+from splatting.host.listing import as_utf8
 from splatting.viewer.tabs import Tell, serialized
 from splatting.viewer.views import Pose, SceneCameras, pose_of
 from utils.system_utils import UserError
@@ -18,15 +18,18 @@ from utils.system_utils import UserError
 if TYPE_CHECKING:
     import viser
 
-OFF, LENGTH, GROUND, FRONT = TOOLS = ("Nothing", "A length", "The ground", "The front")
-_POINTS = {LENGTH: 2, GROUND: 3, FRONT: 2}
-_COLOURS = {LENGTH: (255, 200, 0), GROUND: (60, 200, 90), FRONT: (240, 80, 200)}
+OFF, LENGTH, GROUND, FRONT, NOTE = TOOLS = ("Nothing", "A length", "The ground", "The front", "A note")
+_POINTS = {LENGTH: 2, GROUND: 3, FRONT: 2, NOTE: 1}
+_COLOURS = {LENGTH: (255, 200, 0), GROUND: (60, 200, 90), FRONT: (240, 80, 200), NOTE: (80, 160, 255)}
 _SAYS = {
     OFF: "Choose what to click.",
     LENGTH: "Click the two ends of a length.",
     GROUND: "Click three points of the ground, far from each other.",
     FRONT: "Click two points, from left to right, of a line that is to be looked at straight on.",
+    NOTE: "Click what a note of an exported page tells of.",
 }
+_TILTED = 8.0  # degrees between the ground and the photos' horizons, above which a mistake is likelier than a slope
+_FLAT = 0.2  # least height of the ground's triangle, in parts of its longest side
 _SIZE, _WIDTH = 0.006, 0.004  # radius of a point and width of a line, by the scene's size
 
 Find = Callable[[Pose, np.ndarray, Callable[[np.ndarray | None], None]], None]
@@ -40,6 +43,7 @@ class Place:
         self.record: dict[str, Any] | None = recorded_similarity(str(folder), scene).get(ENTRY)
         of_scene = read_orientation(Path(scene)) if scene else None
         self._of_scene = bool(scene) and (of_scene is None or of_scene == self.record)
+        self.before: list[tuple[Any, list[tuple[Path, Any]]]] = []  # records before each `write`, as of `_put`
 
     @property
     def unit(self) -> tuple[float, str]:
@@ -49,21 +53,34 @@ class Place:
 
     def write(self, record: dict[str, Any]) -> list[Path]:
         """Keep a record in the model, and where convert.py --orient does unless another one is there; the files."""
-        written = []
-        if self._of_scene:
-            written.append(Path(self._scene) / FILE)
-            write_json(written[0], record)
-        if (self._folder / MODEL_JSON).is_file() or not written:
-            add_to_model_json(self._folder, **{ENTRY: record})
-            written.append(self._folder / MODEL_JSON)
+        records = [(Path(self._scene) / FILE, read_orientation(Path(self._scene)))] if self._of_scene else []
+        if (self._folder / MODEL_JSON).is_file() or not records:
+            records.append((self._folder / MODEL_JSON, read_model_json(self._folder).get(ENTRY)))
+        self.before.append((self.record, records))
+        return self._put(record, [(path, record) for path, _ in records])
+
+    def restore(self) -> list[Path]:
+        """Put back what the last `write` replaced; the files."""
+        return self._put(*self.before.pop())
+
+    def _put(self, record: dict[str, Any] | None, records: list[tuple[Path, Any]]) -> list[Path]:
+        """Write the records of files, None: without one. record: the one that counts from now on."""
+        for path, entry in records:
+            if path.name == MODEL_JSON:
+                others = {name: other for name, other in read_model_json(self._folder).items() if name != ENTRY}
+                write_json(path, others if entry is None else others | {ENTRY: entry})
+            elif entry is None:
+                path.unlink(missing_ok=True)
+            else:
+                write_json(path, entry)
         self.record = record
-        return written
+        return [path for path, _ in records]
 
 
 class MeasureTab:
     """Controls for what to click, and points. find: calls back with the place of the surface along a ray, or None.
 
-    place: where to keep what was set, None: nowhere. told: called with the files that were written.
+    place: where to keep what was set, None: nowhere. told: called with what was done and the files that were written.
     """
 
     def __init__(
@@ -72,22 +89,25 @@ class MeasureTab:
         cameras: SceneCameras,
         find: Find,
         place: Place | None,
-        told: Callable[[Any, list[Path]], None],
+        told: Callable[[Any, str, list[Path]], None],
         tell: Tell,
     ) -> None:
         gui, self._server, self._cameras, self._find, self._place = server.gui, server, cameras, find, place
         self.points: dict[str, list[np.ndarray]] = {tool: [] for tool in _POINTS}
         self._drawn: list[Any] = []
+        self._eye, self._doubted = np.zeros(3), False
         self.tool = gui.add_dropdown("Click", TOOLS)
         self.says = gui.add_markdown(_SAYS[OFF])
         hint = "of the length, in metres; 0: not known"
         self.metres = gui.add_number("True length", 0.0, min=0.0, max=1e6, step=0.01, hint=hint)
         clear = gui.add_button("Clear", color="gray")
         self.keep = gui.add_button("Set right", hint="scale, upright and front, for exports", disabled=True)
+        self.back = gui.add_button("As before", hint="take the last “Set right” back", color="gray", disabled=True)
         self.tool.on_update(serialized(lambda _: self._choose()))
         self.metres.on_update(serialized(lambda _: self._show()))
         clear.on_click(serialized(lambda _: self._clear()))
-        self.keep.on_click(serialized(lambda event: told(event.client, self.write()), tell))
+        self.keep.on_click(serialized(lambda event: told(event.client, "Set right", self.write()), tell))
+        self.back.on_click(serialized(lambda event: told(event.client, "As before", self.restore()), tell))
 
     def _choose(self) -> None:
         """Listen to clicks while there is something to click."""
@@ -99,13 +119,15 @@ class MeasureTab:
     async def _clicked(self, event: Any) -> None:
         pose, tool = pose_of(event.client.camera), self.tool.value
         if pose is not None and tool in _POINTS:
-            self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point))
+            eye = np.array(pose.position)
+            self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point, eye))
 
-    def add(self, tool: str, point: np.ndarray | None) -> None:
-        """Take a point (3,); a full tool begins anew. None: nothing is there."""
+    def add(self, tool: str, point: np.ndarray | None, eye: np.ndarray | None = None) -> None:
+        """Take a point (3,); a full tool begins anew. None: nothing is there. eye: where it was clicked from."""
         if point is None:
             self.says.content = "There is no surface; click another point."
             return
+        self._doubted, self._eye = False, self._eye if eye is None else eye
         points = self.points[tool]
         self.points[tool] = [*points, point] if len(points) < _POINTS[tool] else [point]
         self._show()
@@ -136,24 +158,50 @@ class MeasureTab:
                 ends = np.stack([points, points[1:] + points[:1]], axis=1)[: len(points) if len(points) > 2 else 1]
                 lines = f"/measured/{tool}/lines", ends.astype(np.float32), _COLOURS[tool]
                 self._drawn.append(scene.add_line_segments(*lines, thickness=_WIDTH * size))
-        self.says.content, scale, unit = _SAYS[self.tool.value], *(self._place.unit if self._place else (1.0, "units"))
+        scale, unit = self._place.unit if self._place else (1.0, "units")
+        note = self._whole(NOTE) if self.tool.value == NOTE else None
+        self.says.content = _SAYS[self.tool.value] if note is None else self._note(note[0])
         if self.length is not None:
             said = f"{self.length * scale:.4g} {unit}"
             self.says.content = f"The length is {said}. {self.says.content}"
             self._drawn.append(scene.add_label("/measured/length", said, position=np.mean(self.points[LENGTH], axis=0)))
         if (ground := self._whole(GROUND)) is not None:
-            normal = np.cross(*(ground[1:] - ground[0]))
-            cosine = abs(normal @ self._cameras.up) / max(float(np.linalg.norm(normal)), 1e-12)
-            tilt = math.degrees(math.acos(min(1.0, cosine)))
-            self.says.content = f"The ground is tilted by {tilt:.1f} degrees in the photos. {self.says.content}"
+            tilt = f"The ground is tilted by {self._tilt(ground):.1f} degrees in the photos."
+            self.says.content = f"{tilt} {self.says.content}"
         known = (self.length or 0) > 0 and self.metres.value > 0
         whole = known or any(self._whole(tool) is not None for tool in (GROUND, FRONT))
         self.keep.disabled = self._place is None or not whole
+        self.back.disabled = not (self._place and self._place.before)
+
+    def _tilt(self, ground: np.ndarray) -> float:
+        """Degrees between what is up for the ground (3,3) and for the photos."""
+        normal = ground_normal(ground)
+        cosine = abs(normal @ self._cameras.vertical) / np.linalg.norm(normal).clip(1e-12)
+        return math.degrees(math.acos(min(1.0, cosine)))
+
+    def _note(self, point: np.ndarray) -> str:
+        """The lines of a file of notes for a point (3,): the photo nearest to the eye that shows it, and where."""
+        found = self._cameras.place_in_photo(point, self._eye)
+        if found is None:
+            return "No training photo shows this point; click another one."
+        lines = f"camera: {as_utf8(found[0])}\n    at: {found[1][0]:.0f} {found[1][1]:.0f}"
+        return f"For `export.py --notes`, below a line `## NAME`:\n\n    {lines}"
+
+    def _check_ground(self, ground: np.ndarray) -> None:
+        """UserError for doubtful points (3,3), the first time."""
+        flat, tilt = np.linalg.norm(ground_normal(ground)) < _FLAT, self._tilt(ground)
+        if self._doubted or not (flat or tilt > _TILTED):
+            return
+        self._doubted = True
+        fault = "its points lie nearly on a line" if flat else f"it is tilted by {tilt:.0f} degrees in the photos"
+        raise UserError(f"the ground is doubtful, as {fault}; click others, or press “Set right” again to keep it")
 
     def write(self) -> list[Path]:
         """Keep what was measured; the files. UserError for what cannot be kept."""
         if self._place is None or self.keep.disabled:
             raise UserError("there is nothing to set right; click the ground, the front, or a length that you know")
+        if (ground := self._whole(GROUND)) is not None:
+            self._check_ground(ground)
         metres = self.metres.value if math.isfinite(self.metres.value) else 0.0
         scale = metres / self.length if self.length and metres > 0 else None
         moved = {tool: None if (it := self._whole(tool)) is None else it + self._place.offset for tool in _POINTS}
@@ -161,5 +209,13 @@ class MeasureTab:
         record = measured_record(self._place.record, above, scale, moved[GROUND], moved[FRONT])
         Similarity.of(record, "what was measured")  # a scale that no scene has
         files = self._place.write(record)
+        self._show()
+        return files
+
+    def restore(self) -> list[Path]:
+        """Take the last `write` back; the files. UserError without one."""
+        if self.back.disabled:
+            raise UserError("nothing was set right since this page began; press “Set right” first")
+        files = self._place.restore()
         self._show()
         return files

@@ -220,10 +220,10 @@ class Page:
 
         self.requests.ask(ask)
 
-    def _tell_set(self, client: "viser.ClientHandle", files: list[Path]) -> None:
+    def _tell_set(self, client: "viser.ClientHandle", what: str, files: list[Path]) -> None:
         names = " and ".join(map(str, files))
-        tqdm.write(as_utf8(f"Set right; written into {names}"), file=sys.stdout)
-        self._notify(client, "Set right", f"exports of this scene stand so from now on: {names}")
+        tqdm.write(as_utf8(f"{what}; written into {names}"), file=sys.stdout)
+        self._notify(client, what, f"exports of this scene stand so from now on: {names}")
 
     def _save_path(self, client: "viser.ClientHandle", folder: Path) -> None:
         replaced, file = self.path.file.replaced(), self.path.save()

@@ -10,6 +10,8 @@ import numpy as np
 
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
+from scene.readers.info import CameraInfo, up_of
+from scene.readers.tracks import projected
 from splatting.camera_paths.poses import facing, focus_point, opening, poses_of, unit
 from splatting.camera_paths.start import best_start
 from splatting.host.listing import as_utf8
@@ -87,7 +89,8 @@ class SceneCameras:
     """by_name: the cameras, training ones first, with names such as `train 3: IMG_0007`.
 
     start: the name of the one that a page begins at, as an exported page does; "" without any. up: their mean upward
-    direction, unit length: images are mostly taken upright. middle: of their places. size: of the scene.
+    direction, unit length: images are mostly taken upright. vertical: that at right angles to their horizons. middle:
+    of their places. size: of the scene.
     """
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
@@ -97,15 +100,28 @@ class SceneCameras:
             for index, camera in enumerate(cameras)
         }
         self.start, self._target, self.up, self.size = "", None, np.array([0.0, -1.0, 0.0]), 1.0
-        self._places, self.middle = np.zeros((0, 3)), np.zeros(3)
+        self._places, self.middle, self.vertical = np.zeros((0, 3)), np.zeros(3), self.up
+        self._train = list(train)
         if self.by_name:
             poses = poses_of([*train, *test])
             self.start = list(self.by_name)[best_start(poses_of(train or test))]
             self._places, self.middle = poses.positions, poses.positions.mean(axis=0)
             self._target = focus_point(poses)
             self.up = unit(poses.up) if np.linalg.norm(poses.up) > 1e-6 else self.up
+            self.vertical = up_of(poses.turns)
             offsets = poses.positions - self.middle
             self.size = float(np.linalg.norm(offsets, axis=1).max()) * _MARGIN or 1.0
+
+    def place_in_photo(self, point: np.ndarray, eye: np.ndarray) -> tuple[str, tuple[float, float]] | None:
+        """The training photo nearest to a place (3,) of those that show a point (3,), and where; None: none does."""
+        for row in np.linalg.norm(self._places[: len(self._train)] - eye, axis=1).argsort(kind="stable"):
+            it = self._train[row]
+            size = {"width": it.image_width, "height": it.image_height}
+            lens = {"fx": it.fx, "fy": it.fy, "cx": it.cx, "cy": it.cy, "native": it.lens}
+            x, y, is_shown = projected(CameraInfo(0, it.R, it.T, **size, **lens), point[None])
+            if is_shown:
+                return it.image_name, tuple(np.concatenate([x, y]) * it.photo_size / (it.image_width, it.image_height))
+        return None
 
     def up_at(self, axes: np.ndarray) -> Vector:
         """An upward direction with which a camera with these axes looks as its image does, near that of all.
