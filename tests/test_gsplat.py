@@ -65,7 +65,7 @@ NAMES = ("means", "quats", "scales", "opacities", "colors", "views")
 
 
 def places(model: str, at: Tensor) -> Tensor:
-    """Where a camera of focal length 1 shows points of its view, (N, 2); a fisheye is equidistant."""
+    """Project points of a view, (N, 2), by a camera of focal length 1; a fisheye is equidistant."""
     away = at[:, :2].norm(dim=1, keepdim=True)
     if model == "fisheye":
         return at[:, :2] * torch.atan2(away, at[:, 2:]) / away
@@ -423,7 +423,7 @@ def test_what_has_a_tile_is_shown(opacity):
 
 @CPU_AND_GPU
 def test_a_colour_that_is_not_finite_spoils_no_other_gradient(device):
-    """Of a Gaussian in the image, and of one without a tile, whose colour nothing reads on a GPU."""
+    """Two Gaussians: one in the image, and one without a tile, whose colour nothing reads on a GPU."""
     given = Inputs(5, degree=2, count=4000)
     with torch.no_grad():
         given.scales *= 0.1

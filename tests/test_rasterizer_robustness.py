@@ -75,7 +75,7 @@ def test_a_gaussian_that_is_not_finite_is_as_if_it_were_not_there(raw, name, cam
 
 
 def planes_of(inputs: dict[str, Tensor], camera, channels: int, means2d: Tensor) -> list[Tensor]:
-    """What a camera shows: a colour, an inverse depth and a transmittance, or so many channels."""
+    """Return what a camera shows: a colour, an inverse depth and a transmittance, or so many channels."""
     if not channels:
         out = render(inputs, camera, means2d, want_absolute_gradient=True)
         return [getattr(out, plane) for plane in PLANES]
