@@ -34,6 +34,7 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
+from scene.splats.spz import WRITTEN
 from scene.with_splats import load_file, model_of, place, splats_of
 from splatting.camera_paths.without_scene import WithoutScene, circle, record_of, recorded_cameras, warn_if_moved
 from splatting.exports.cleaning import OPTION as CLEAN_OPTION
@@ -189,7 +190,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
     _check_fitting(args, entries)
     make_path = _path_maker(args.path)
     for to, entry in zip(args.to, entries, strict=True):
-        entry.check(to)
+        if "spz_version" not in entry.options or args.spz_version in (None, WRITTEN[0]):
+            entry.check(to)
         _refuse_to_replace_a_model(Path(to), args.ply)
     check_upright(args)
     for to in _cleaned_targets(args)[:1]:
@@ -217,7 +219,8 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
                 around = Around(cameras, background, pipe, make_path, **details, made={})
             in_place[key] = placed(args, entry.of_scene, chosen, around)
         chosen, around = in_place[key]
-        what = entry.write(to, chosen, *((around,) if around else ()))
+        how = [around] if around else [args.spz_version or WRITTEN[0]] if "spz_version" in entry.options else []
+        what = entry.write(to, chosen, *how)
         print(f"Wrote {to}: {_told(to, entry, what, chosen, splats, args)}, {time.perf_counter() - start:.1f} s")
         if "walk" in entry.options and len(chosen) > FOR_PHONES:
             print(f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; make a page for them by --max_splats")
@@ -247,7 +250,7 @@ def _check_fitting(args: argparse.Namespace, entries: Sequence[Format]) -> None:
     """UserError for an option that is for files of other kinds, and for a file that is named twice."""
     if twice := [to for place, to in enumerate(args.to) if to in args.to[:place]]:
         raise UserError(f"--to {twice[0]} is given twice; give each file once")
-    for option in ("path", *_DETAILS, "raw"):
+    for option in ("path", *_DETAILS, "raw", "spz_version"):
         if getattr(args, option) and not any(option in entry.options for entry in entries):
             endings = " or ".join(other.ending for other in FORMATS if option in other.options)
             raise UserError(f"--{option} is for {endings}; leave it out, or end --to with {endings}")
@@ -323,6 +326,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
         "(docs/guide/web_pages.md; default: none)")  # fmt: skip
     add("--walk", action="store_true", help="let guests of an .html walk on the floor and stop at walls (default: off)")
     add("--raw", action="store_true", help="do not --clean an .html (default: cleaned, if its scene is there)")
+    add("--spz_version", type=int, choices=WRITTEN, metavar="N",
+        help="version of an .spz: 4, or 3 or 2 for programs that do not read it (default: 4)")  # fmt: skip
     add("--voxel", type=float, metavar="UNITS",
         help="size of a mesh's voxels in the scene's unit (default: two pixels at the median depth)")  # fmt: skip
     add("--triangles", type=int, metavar="N",

@@ -1,5 +1,6 @@
 """Models of other tools: PLYs of any form, as the start of a training and in render.py; what is refused."""
 
+import gzip
 import json
 import re
 import sys
@@ -270,6 +271,7 @@ def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
         ("--ply a.ply --to b.html --path elipse", "--path must be interpolate, ellipse, spiral or a file"),
         ("--ply a.ply --to b.html", "no file a.ply"),
         ("--ply a.ply --to b.spz --to c.ply --to b.spz", "--to b.spz is given twice; give each file once"),
+        ("--ply a.ply --to b.ply --spz_version 3", "--spz_version is for .spz; leave it out, or end --to with .spz"),
         ("--ply a.ply --to b.spz --to c.plx", "the format of c.plx is unknown"),
         ("--ply a.ply --to b.html --to mesh.ply", "meshes need training views"),
     ],
@@ -290,6 +292,16 @@ def test_a_page_plays_the_camera_path(tmp_path, colmap_scene):
     (track,) = json.loads(text)["settings"]["animTracks"]
     fov = track["keyframes"]["values"]["fov"]
     assert track["duration"] == 7 and (fov[0], fov[-1]) == (40, 50)
+
+
+def test_older_versions_of_spz_need_no_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    words = "--ply", written(tmp_path, ".ply", splats(20)), "--to", tmp_path / "a.spz", "--spz_version"
+    for version in (3, 2):
+        export.export(*_export_options(*words, version))
+        assert gzip.decompress((tmp_path / "a.spz").read_bytes())[4] == version
+    with pytest.raises(UserError, match="needs the package zstandard"):
+        export.export(*_export_options(*words, 4))
 
 
 @pytest.mark.parametrize(("ending", "module"), [(".spz", "zstandard"), (".usdz", "pxr"), (".sog", None)])

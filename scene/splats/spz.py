@@ -1,4 +1,4 @@
-"""SPZ, the format of Niantic and Adobe: versions 4 and 2 are written, versions 1 to 4 are read.
+"""SPZ, the format of Niantic and Adobe: versions 2 to 4 are written, versions 1 to 4 are read.
 
 Published in the README of github.com/nianticlabs/spz. Version 4 is a header of 32 bytes, a table of streams, and a zstd
 stream for each attribute: positions (24-bit fixed point), opacities, colours, logarithms of scales (steps of 1/16 from
@@ -31,6 +31,7 @@ from splatting.files.unread import say_unread
 from utils.system_utils import UserError, atomic_write
 
 MAGIC = 0x5053474E
+WRITTEN = 4, 3, 2  # versions, the default first
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, splats, SH degree, bits of a fraction, flags, streams
 _HEADER_END = struct.Struct("<I12x")  # of version 4: where the table of streams begins
 _ANTIALIASED, _EXTENDED = 1, 2  # flags
@@ -59,26 +60,34 @@ class _Header(NamedTuple):
     streams: int
 
 
-def write_spz(path: str | os.PathLike, splats: Splats) -> None:
-    """Write version 4, whole or not at all. UserError without the package zstandard."""
-    zstandard = find_zstandard(path)
+def write_spz(path: str | os.PathLike, splats: Splats, version: int = WRITTEN[0]) -> None:
+    """Write one of the versions WRITTEN, whole or not at all. UserError without zstandard, which version 4 needs."""
+    zstandard = find_zstandard(path) if version == 4 else None
     splats = _drawn_in(splats)
     warn_of_sizes([splats])
-    splats = half_rotated(selected(splats, morton_order(splats.means)))
+    splats = selected(splats, morton_order(splats.means))
+    content = _packed_by_zstd(splats, zstandard) if zstandard else packed_spz(splats, version)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _packed_by_zstd(splats: Splats, zstandard: ModuleType) -> bytes:
+    """Pack a whole file of version 4."""
+    splats = half_rotated(splats)
     bits, streams = _streams(splats, _rotation_codes(splats.rotations))
     compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
     packed = [compressor.compress(stream) for stream in streams]
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
     header = _packed_header(4, splats, bits, len(streams)) + _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
-    with atomic_write(path) as temporary:
-        temporary.write_bytes(header + table + b"".join(packed))
+    return header + table + b"".join(packed)
 
 
-def packed_spz_2(splats: Splats) -> bytes:
-    """A whole file of version 2, in which the splats keep their order. UserError for positions that it cannot hold."""
+def packed_spz(splats: Splats, version: int) -> bytes:
+    """Pack a whole file of version 2 or 3, splats in their order. UserError for positions that it cannot hold."""
     splats = half_rotated(splats)
-    bits, streams = _streams(splats, _three_bytes(splats.rotations))
-    return gzip.compress(_packed_header(2, splats, bits, 0) + b"".join(streams), mtime=0)
+    rotations = _three_bytes if version == 2 else _rotation_codes
+    bits, streams = _streams(splats, rotations(splats.rotations))
+    return gzip.compress(_packed_header(version, splats, bits, 0) + b"".join(streams), mtime=0)
 
 
 def _packed_header(version: int, splats: Splats, bits: int, streams: int) -> bytes:

@@ -158,7 +158,7 @@ FORMATS = (
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept", in_order=True),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
-    Format(".spz", write_spz, "Niantic, version 4", check=find_zstandard),
+    Format(".spz", write_spz, "Niantic, version 4, or 3 or 2", options=("spz_version",), check=find_zstandard),
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_splat_transform),
     Format(".glb", write_glb, "glTF with KHR_gaussian_splatting, float32", in_order=True),
     Format(

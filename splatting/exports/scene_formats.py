@@ -24,7 +24,7 @@ import numpy as np
 
 from scene.splats.packing import rgba_bytes
 from scene.splats.splats import Splats, half_rotated, opacities
-from scene.splats.spz import packed_spz_2
+from scene.splats.spz import packed_spz
 from utils.system_utils import UserError, atomic_write, temporary_folder
 
 EXTENSION = "KHR_gaussian_splatting"
@@ -51,7 +51,7 @@ def write_glb(path: str | os.PathLike, splats: Splats) -> None:
 
 def write_compressed_glb(path: str | os.PathLike, splats: Splats) -> None:
     """Write a compressed GLB of one splat or more, whole or not at all. UserError for what it cannot hold."""
-    packed = packed_spz_2(splats)
+    packed = packed_spz(splats, 2)
     elsewhere = f"{EXTENSION}:OPACITY", f"{EXTENSION}:SH_DEGREE_0_COEF_0"
     attributes = {name: x for name, x in _attributes(half_rotated(splats)).items() if name not in elsewhere}
     document = _document(attributes, [len(packed)], splats.antialiasing)
