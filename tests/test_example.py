@@ -1,6 +1,7 @@
 """The worked examples of parts (tests/parts/example): each is one file and one line, and resumes to the byte."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -70,3 +71,43 @@ def test_a_strategy_with_a_value_for_each_gaussian(colmap_scene, tmp_path):
     # Its name is in model.json, so the strategy joins late.
     again = _train(colmap_scene, "-m", tmp_path / "resumed", "--start_checkpoint", checkpoint, *often)
     assert again.status == 0 and _ply(tmp_path / "resumed") == _ply(tmp_path / "two"), again.stderr
+
+
+@pytest.mark.slow
+def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
+    """As the guide has them made: a file and a line each."""
+    for path in (*ROOT.glob("*.py"), ROOT / "pyproject.toml", ROOT / "version.txt"):
+        shutil.copy(path, tmp_path)
+    for room in (
+        "arguments",
+        "gaussian_renderer",
+        "integrations",
+        "lpipsPyTorch",
+        "scene",
+        "splatting",
+        "tests",
+        "utils",
+    ):
+        shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("node_modules", "__pycache__"))
+    for name in ("grey", "patient"):
+        shutil.copy(ROOT / "tests/parts/example" / f"{name}.py", tmp_path / "splatting/parts")
+    registry = tmp_path / "splatting/registry.py"
+    registry.write_text(
+        registry.read_text().replace('    "sparse_depth",', '    "grey",\n    "patient",\n    "sparse_depth",')
+    )
+    rules = "nobody_names and (adc or grey or patient) or hidden1 or tools"
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-n",
+        "0",
+        "-p",
+        "no:cacheprovider",
+        "tests/test_parts.py",
+        "-k",
+        rules,
+    ]
+    done = subprocess.run([*command, "-m", "not slow"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

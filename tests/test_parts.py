@@ -54,11 +54,17 @@ def _own(name: str) -> list[Path]:
     return [FOLDER / f"{name}.py", *FOLDER.glob(f"{name}_*.py")]
 
 
+def _heirs(name: str) -> list[str]:
+    """The parts that inherit from a part, as strategies may."""
+    return [other for other in PARTS if other != name and issubclass(part_class(other), part_class(name))]
+
+
 def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: all but its own and the registry."""
+    """All Python files of the project that may not know a part: all but its own, its heirs' and the registry."""
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
     registry = ROOT / "splatting" / "registry.py"
-    yield from (path for path in found if path not in (registry, *_own(name)))
+    may = [registry, *(path for one in (name, *_heirs(name)) for path in _own(one))]
+    yield from (path for path in found if path not in may)
 
 
 @cache
@@ -133,9 +139,13 @@ print(*(option.name for option in OPTIONS), *vars(launch_options()))
 
 
 def _halves() -> list[list[str]]:
-    """Halves of the parts, so that for any two of them one half lacks the first and has the second."""
+    """Halves of the parts, so that for any two of them one half lacks the first and has the second, unless it inherits.
+
+    What inherits from a part goes with it.
+    """
     digits = range((len(PARTS) - 1).bit_length())
-    return [[name for n, name in enumerate(PARTS) if n >> digit & 1 == bit] for digit in digits for bit in (0, 1)]
+    halves = [{name for n, name in enumerate(PARTS) if n >> digit & 1 == bit} for digit in digits for bit in (0, 1)]
+    return [[name for name in PARTS if name in half or any(name in _heirs(one) for one in half)] for half in halves]
 
 
 @pytest.mark.parametrize("hidden", _halves())
