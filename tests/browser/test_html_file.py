@@ -85,7 +85,7 @@ def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
 def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, height):
-    """Nothing beside the photo is shown; the help, which covers the model, begins closed."""
+    """What is above and below a wide photo on a phone fades; the help, which covers the model, begins closed."""
     phone = width < height
     context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
     tab = context.new_page()
@@ -95,6 +95,8 @@ def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, heigh
     fov, (position, turn) = narrowed(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
     view = free_view(width, height, fov, position, turn, "cpu")
     assert psnr(shown, expected(splats, view)) > 31
+    faded = tab.evaluate("[...document.querySelectorAll('.sse-sceneLayer > div')].map(e => e.style.background).join()")
+    assert ("linear-gradient(0deg" in faded) == phone and ("linear-gradient(90deg" in faded) != phone
     assert tab.locator(".sse-controlsHint").evaluate("e => e.classList.contains('sse-hidden')")
     context.close()
 
