@@ -12,8 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gaussian_renderer import render
-from gaussian_renderer.blending import weighted_sums
+from gaussian_renderer import draw, render
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 
@@ -65,14 +64,11 @@ def median_at(
     camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, column: int, row: int
 ) -> float:
     """The median depth at one pixel, as in `Surface`, by the weights of all Gaussians that reach it."""
-
-    def pixel(image: Tensor) -> Tensor:
-        only = torch.zeros_like(image)
-        only[:, row, column] = 1
-        return only
-
     means = gaussians.get_xyz
-    weights = weighted_sums(camera, gaussians, pipe, means.new_zeros(3), pixel)[:, 0]
+    drawn = draw(camera, gaussians, pipe, means.new_zeros(3))
+    pixel = torch.zeros_like(drawn.image)
+    pixel[:, row, column] = 1
+    weights = drawn.color_gradient(pixel)[:, 0]  # the image is linear in colours
     found = weights.nonzero()[:, 0]
     along = camera.full_proj_transform[:, 3]
     depths, order = (means[found] @ along[:3] + along[3]).sort(stable=True)
