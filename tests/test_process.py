@@ -1,6 +1,5 @@
 """train.py's process: what it imports and begins early, the seconds that it notes, its clock and its threads."""
 
-import gc
 import json
 import os
 import signal
@@ -196,17 +195,15 @@ def test_seconds_of_a_stopped_process_do_not_count():
     assert wall > 3.0 and counted < wall - 2.5
 
 
-def test_the_thread_of_the_clock_ends_with_its_last_user():
-    def is_there() -> bool:
-        return any(thread.name == "ticks" for thread in threading.enumerate())
-
-    wait_for(lambda: gc.collect() or not is_there())  # of tests before
+def test_the_thread_of_the_clock_ends_with_its_last_user(monkeypatch):
+    monkeypatch.setattr(clock, "_clock", clock._Running())  # without the users of tests before
     watches = [Stopwatch(), Stopwatch()]
+    thread = clock._clock._thread
     watches.pop()
     time.sleep(2 * clock._TICK)
-    assert is_there()
+    assert thread.is_alive()
     watches.pop()
-    wait_for(lambda: not is_there())
+    wait_for(lambda: not thread.is_alive())
 
 
 @pytest.mark.slow

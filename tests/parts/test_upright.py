@@ -206,6 +206,7 @@ def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
     """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
     points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
     mesh = replace(textured(points), colors=np.zeros((3, 3), np.uint8))
+    monkeypatch.setattr("splatting.exports.mesh.measure", lambda *_: ())
     monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
     for ending, expected in (("ply", points[:, [0, 2, 1]] * [1, 1, -1] if upright else points), ("glb", points)):
         path = tmp_path / f"mesh.{ending}"
