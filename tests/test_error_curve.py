@@ -126,16 +126,29 @@ class TestFile:
         assert continue_curve(tmp_path, 0) == [] and not path.exists()
 
 
-@pytest.mark.parametrize(("iterations", "views"), [(200, 4), (300, 8), (600, 8), (2000, 40)])
-def test_a_short_training_scores_with_its_end_within_five_percent(tmp_path, iterations, views):
-    """Where need be, points between score no training views."""
+@pytest.mark.parametrize(
+    ("iterations", "views", "points", "sets"),
+    [
+        (200, 4, 12, 1),
+        (300, 8, 12, 1),
+        (600, 8, 12, 2),
+        (700, 8, 6, 1),
+        (1000, 7, 6, 2),
+        (2000, 8, 11, 2),
+        (2000, 40, 12, 2),
+    ],
+)
+def test_a_short_training_scores_with_its_end_within_five_percent(tmp_path, iterations, views, points, sets):
+    """Where need be, points between score no training views; where there are few test views, all of these."""
     recorder, seen = _recorder(tmp_path, iterations, [-1], {name: [20.0] * views for name in ("test", "train")})
     for iteration in range(1, iterations + 1):
         if recorder.due(range(iteration, iteration + 1), 0, iteration / 10):
             recorder.add(iteration, iteration / 10, 5)
     assert 0.46 * sum(kind == "scores" for kind, _ in seen) <= 0.05 * iterations
-    assert len({row["iteration"] for row in recorder.rows}) == 13
-    assert [row["train_psnr"] is None for row in recorder.rows[:-1]] == [iterations < 600] * 13
+    assert len({row["iteration"] for row in recorder.rows}) == points + 1
+    between = [row for row in recorder.rows if row["iteration"] < iterations]
+    assert [row["train_psnr"] is None for row in between] == [sets == 1] * points
+    assert all(row["subset"] is None for row in between) == (points < 12)
 
 
 class TestPoints:

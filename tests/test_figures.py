@@ -60,6 +60,7 @@ def test_the_curve_of_a_training(tmp_path, drawn):
     assert "gap, 6.5 dB at the end" in legends and "gap, 0.125 at the end" in legends  # of all views
     for axes in (upper, lower):
         assert not axes.get_legend().get_window_extent().overlaps(axes.get_window_extent())
+    assert not lower.get_legend().get_window_extent().overlaps(lower.xaxis.label.get_window_extent())
     draw_curve(tmp_path / "error_vs_time.png", [rows[2], rows[4]], "a model", {"test": 7, "train": 6})
     assert points(drawn[1].axes[0], "all 7 test views") == [[[1, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
 

@@ -32,6 +32,7 @@ SHORTEST = 200  # iterations of a training that is scored between, too
 GRIDS = ((4, 32), (2, 12))  # points while the number of iterations doubles, and their number before the last iteration
 SHARE = 0.025  # of a training that scoring may take by its estimate; 0.05 is promised, and early points may be dearer
 MOST_SHARE = 0.05  # the same where one view of each set at each point takes more than SHARE
+FEW_VIEWS, FEW_POINTS = 8, 6  # test views, all of which are scored where that leaves so many points
 REPLANNED = 1.5  # times as many iterations as were expected, or more, get points of their own
 VIEW_COST = 0.5  # of scoring a view, in iterations: it takes no gradient and no step
 _ROOT = Path(__file__).resolve().parents[2]
@@ -46,17 +47,23 @@ def curve_points(
     The points are evenly spaced in the logarithm of the iteration, and follow from the options alone, so that the same
     command scores the same on every machine. They score as many views as fit SHARE of the training, at least one, on
     the coarse grid; all views on the fine one where that fits, too. A part is a power of two, so that runs of nearly as
-    many iterations score the same one. sets: of `views` each. taken: the iterations of a run whose schedule has
+    many iterations score the same one. One of FEW_VIEWS would tell little of all, so these are scored at fewer points,
+    if need be without train views. sets: of `views` each. taken: the iterations of a run whose schedule has
     `iterations`, None: the same. Then there is the coarse grid alone.
     """
     (fine, many), coarse = GRIDS
     if iterations < SHORTEST or (taken is not None and coarse[1] * VIEW_COST > MOST_SHARE * taken):
         return frozenset(), 1
     whole = {t for t in whole if 0 < t < iterations} | {iterations}
-    budget = SHARE * (iterations if taken is None else taken) / VIEW_COST - len(whole) * sets * views
+    scored, ends = (iterations if taken is None else taken) / VIEW_COST, len(whole) * sets * views
+    budget = SHARE * scored - ends
     density, count = (fine, many) if taken is None and budget >= sets * views * many else coarse
-    places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)}
     most = max(1, int(budget / (sets * count)))
+    for each in (sets * views, views) if most < views <= FEW_VIEWS else ():
+        if (fit := min(int((MOST_SHARE * scored - ends) / each), count)) >= FEW_POINTS:
+            density, count, most = density * fit / count, fit, views
+            break
+    places = {round(iterations * 2 ** (-place / density)) for place in range(1, count + 1)}
     return frozenset(places - whole), views if most >= views else 1 << (most.bit_length() - 1)
 
 

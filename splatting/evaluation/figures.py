@@ -136,8 +136,8 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
         )
     _label(upper, "", "PSNR (dB)")
     _label(lower, "seconds of training, without scoring and saving", "1 - SSIM", log=True)
-    for axes in (upper, lower):
-        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
+    for axes, below in ((upper, -0.05), (lower, -0.2)):  # the label of the lower axis is between
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, below), ncols=2, frameon=False)
     _save(figure, path)
 
 
