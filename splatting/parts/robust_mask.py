@@ -70,7 +70,8 @@ def advise_trained(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
     from splatting.parts.robust_mask_residuals import FEW, MASKED, odd_share, residuals_of
 
     share = odd_share(residuals_of(scene.getTrainCameras(), views, scene.gaussians))
-    text = f"{share:.0%} of the photos show what a short training does not, such as passers-by or reflections"
+    text = f"{share:.0%} of the photos have passers-by, reflections or other things that change"
+    text = text if share else "no photo has passers-by, reflections or other things that change"
     yield note(text, f"--robust_mask {MASKED:g}" if share > FEW else "")
 
 

@@ -152,10 +152,11 @@ class DecidedSchedule(Schedule):
         """Say once how many Gaussians a time budget trains."""
         if not self._told:
             self._told = True
-            aimed = f", not {aim:,}" if aim else ""
+            steps, enough = (int(float(f"{count:.2g}")) for count in (iterations, trained))
+            aimed = f", not for {aim:,}" if aim else ""
             tqdm.write(
-                f"--time_budget {self.seconds:g} is enough to train about {trained:,} Gaussians{aimed}, as it has "
-                f"about {iterations:,} iterations",
+                f"In {self.seconds:g} s this machine takes about {steps:,} steps, enough for {enough:,} "
+                f"Gaussians{aimed}",
                 file=sys.stderr,
             )
 

@@ -180,7 +180,7 @@ class Run:
         self.gaussians.limit_columns()
 
     def _choose_strategy(self, states: dict[str, Any]) -> Strategy:
-        """Let the strategy join, now that the schedule and the model may say which it is."""
+        """Choose the strategy by the option, the schedule or the model, and let it join the parts."""
         opt = self.opt
         if opt.strategy == "auto":
             opt.strategy = self.schedule.best_strategy(self)

@@ -107,7 +107,7 @@ class Schedule:
         )
 
     def known(self, planned: Sequence[int]) -> list[int]:
-        """Iterations of the run that will take those of the schedule that are planned, as far as it is known."""
+        """Return the iterations of the run at which planned ones of the schedule are due, as far as they are known."""
         return [iteration for iteration in planned if iteration <= self.length]
 
 
