@@ -47,7 +47,7 @@ from scene.with_splats import load_file
 from splatting.camera_paths.render_path import add_path_options, path_request, render_path
 from splatting.evaluation.comparison import BESIDE
 from splatting.evaluation.renders import DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
-from splatting.files.image_files import remove_leftovers, save_png, write_plane
+from splatting.files.image_files import open_image, remove_leftovers, save_png, write_plane
 from splatting.files.json_files import write_json
 from splatting.host.progress import Bar
 from utils.general_utils import safe_state
@@ -226,16 +226,19 @@ def _loaded(
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
 
 
+def _small(path: Path) -> np.ndarray:
+    """Read a picture at _SMALL, as (h, w, 3) float64 of 255."""
+    with open_image(path) as image:
+        return np.asarray(image.convert("RGB").resize(_SMALL), float)
+
+
 def warn_if_elsewhere(model: str, folder: Path) -> None:
     """Warn if most renders of a set are no more like their own photo than like the photos of other views."""
     names = sorted(path.name for path in (folder / "renders").glob("*.png"))
     if len(names) < _FEWEST:
         return
     names = names[:: -(-len(names) // _COMPARED)]
-    renders, photos = (
-        np.stack([np.asarray(Image.open(folder / side / name).convert("RGB").resize(_SMALL), float) for name in names])
-        for side in ("renders", "gt")
-    )
+    renders, photos = (np.stack([_small(folder / side / name) for name in names]) for side in ("renders", "gt"))
     errors = np.abs(renders[:, None] - photos).mean(axis=(2, 3, 4))
     fit = (errors.diagonal()[:, None] < errors).sum(axis=1) >= _BETTER * (len(names) - 1)
     if fit.mean() < _FITTING:

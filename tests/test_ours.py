@@ -35,6 +35,8 @@ MAY = {
     "splatting.sfm.programs._run": FOUND,  # COLMAP, or worker.py
     "splatting.sfm.video._warn_if_cut": "runs the ffmpeg that imageio-ffmpeg finds, without relative entries of PATH",
     "splatting.sfm.video._filters": "the same",
+    "splatting.sfm.video.find_streams": "the same",
+    "splatting.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
     "splatting.host.machine.facts_asked": SELF,
     "splatting.findings.advice._trained": SELF,
     "splatting.evaluation.child.run_child": SELF,

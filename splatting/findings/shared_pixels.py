@@ -24,8 +24,6 @@ def shared_pixels(photos: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
     photos: (n, h, w, 3) uint8. seen: (n, h, w) bool, the pixels that count.
     """
-    from scipy import ndimage  # it takes a while to import
-
     photos = photos.astype(np.int16)
     differing, few = [], photos[:, ::_STEP, ::_STEP]
     for n, photo in enumerate(few):
@@ -37,6 +35,10 @@ def shared_pixels(photos: np.ndarray, seen: np.ndarray) -> np.ndarray:
     usual = np.median(photos[differing], axis=0)
     agreeing = ((_away(photos[differing], usual) <= _NEAR) & seen[differing]).mean(0)
     equal = agreeing >= _NEARLY_ALL
+    if equal.mean() < _LEAST:
+        return found
+    from scipy import ndimage  # it takes a while to import
+
     regions, _ = ndimage.label(equal, np.ones((3, 3)))
     for number, size in enumerate(np.bincount(regions.ravel())[1:], 1):
         if size < _SPECK * equal.size:
