@@ -1,6 +1,7 @@
 """Advice on options: before a training, of a scene whose truth is known; after it, of made-up logs and curves."""
 
 import argparse
+import inspect
 import json
 import os
 import re
@@ -23,6 +24,7 @@ from splatting.files.json_files import write_json
 from splatting.findings import Severity, advice, note
 from splatting.findings.model import check_training
 from splatting.findings.training import what_to_try
+from splatting.registry import tools
 from utils.system_utils import UserError
 
 SIDE = 20
@@ -40,6 +42,15 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
     views = [SimpleNamespace(R=np.eye(3), T=np.array([0, 0, z]), fx=f) for z, f in ((100.0, 50.0), (400.0, 100.0))]
     tracks = [_track(points, np.arange(30)), None, _track(points, np.arange(30))]
     assert abs(advice.distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
+
+
+def test_what_may_be_advised_is_measured():
+    """In the table of what scenes gain that ask for it, or beside: nothing is recommended on other grounds."""
+    measured = (advice.ROOT / "docs/results/options.md").read_text().partition("## One fault")[0]
+    code = [inspect.getsource(tool) for name in ("advise", "advise_trained") for tool in tools(name)]
+    named = {*re.findall(r'"(--\w+)', "".join([*code, inspect.getsource(advice._of_tracks)]))}
+    assert named == {"--antialiasing", "--appearance", "--refine_poses", "--robust_mask", "--sky"}
+    assert all(f"`{name}" in measured for name in named)
 
 
 def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypatch, capsys):

@@ -3,10 +3,8 @@
 Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked.
 """
 
-from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from splatting.findings import Finding, note
 from splatting.option import Option, at_least
 from splatting.part import Needs, Options, Part
 from utils.system_utils import UserError
@@ -14,11 +12,7 @@ from utils.system_utils import UserError
 if TYPE_CHECKING:
     from scene.cameras import Camera
     from scene.point_depths import PointDepths
-    from scene.readers.tracks import Track
-    from scene.scene import Scene
     from splatting.training.iteration import Iteration, Term
-
-FEW_PHOTOS = 16  # 14 gained 0.2 dB by points that hold the depth, 20 and 21 lost as much (docs/results/options.md)
 
 
 class SparseDepth(Part):
@@ -59,10 +53,3 @@ class SparseDepth(Part):
             track = self._tracks[camera.uid]
             self._known[key] = track and points_of(camera, self._views[camera.uid], track, **self._options)
         return self._known[key]
-
-
-def advise(scene: "Scene", tracks: "Sequence[Track | None]") -> Iterator[Finding]:
-    """Whether photos are few."""
-    if any(tracks):
-        count = len(scene.info.train_cameras)
-        yield note(f"{count} photos train", "--sparse_depth 0.1" if count < FEW_PHOTOS else "")
