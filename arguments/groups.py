@@ -78,8 +78,8 @@ class ModelParams(OptionTable):
             help="model of exposure, for photos that differ in brightness or colour. "
                  + "; ".join(f"{a.kind}: {a.summary}" for a in appearances())
                  + "; exports and viewers do not show it"),
-        Option("images_to_load", 0, origin="ours", check=at_least(0), topic="memory", above_zero=True, unset="all",
-            help="largest number of decoded images (photos, masks and depth maps) in memory. The others are "
+        Option("images_to_load", 0, origin="ours", check=at_least(0), topic="memory",
+            help="largest number of decoded images (photos, masks and depth maps) in memory, 0: all. The others are "
                  "read again when they are needed; the result is the same"),
     ))
     # fmt: on
@@ -179,9 +179,9 @@ class OptimizationParams(OptionTable):
             topic="quality and speed",
             help="default: Adam on all Gaussians; sparse_adam: Adam without bias correction, only on the Gaussians "
                  "that the view sees, which is faster if views see little of the scene; mcmc always takes it"),
-        Option("max_num_splats", 0, origin="ours", check=at_least(0), topic=MOST_NEEDED, above_zero=True,
-            unset="no limit with adc, 1,000,000 with mcmc, and with budget as --strategy says",
-            help="largest number of Gaussians. If a training starts with more, only budget removes the surplus"),
+        Option("max_num_splats", 0, origin="ours", check=at_least(0), topic=MOST_NEEDED,
+            help="largest number of Gaussians; 0: no limit with adc, 1,000,000 with mcmc, and with budget as "
+                 "--strategy says. If a training starts with more, only budget removes the surplus"),
         Option("seed", 0, origin="ours, and the reference's fixed seed", check=within(0, 2**63 - 1), stored=MODEL_JSON,
             topic="quality and speed",
             help="seed of every random choice; the same seed gives the same bytes"),

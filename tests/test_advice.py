@@ -188,7 +188,7 @@ def test_training_says_it_at_its_end(colmap_scene, tmp_path, capsys, monkeypatch
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     words = ["-s", str(colmap_scene), "-m", str(tmp_path), "--eval", "--iterations", "12", "-r", "32"]
     words += ["--densify_from_iter", "4", "--densification_interval", "2", "--densify_grad_threshold", "1e-7"]
-    words += ["--max_num_splats", str(cap)] if cap else []
+    words += ["--max_num_splats", str(cap)]
     train.main([*words, "--disable_viewer", "--test_iterations", "2", "12"])
     last = json.loads((tmp_path / LOG).read_text())[-1]
     assert last["iterations_planned"] == 12 and last.get("max_num_splats") == (cap or None)

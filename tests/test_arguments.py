@@ -101,12 +101,13 @@ def test_absurd_values_name_their_option(option, value):
         _parse(f"--{option}={value}")
 
 
-@pytest.mark.parametrize("name", ["time_budget", "gpu_memory", "max_num_splats", "images_to_load"])
-def test_a_typed_zero_that_would_count_as_not_given_is_refused(capsys, name):
+def test_a_typed_zero_is_refused_where_it_would_count_as_not_given(capsys):
     with pytest.raises(SystemExit) as exit_info:
-        train.main(["-s", "absent", f"--{name}", "0"])
+        train.main(["-s", "absent", "--time_budget", "0"])
     assert exit_info.value.code == 2
-    assert f"argument --{name}: must be above 0; leave it out for its default" in capsys.readouterr().err
+    assert "argument --time_budget: must be above 0; leave it out for its default" in capsys.readouterr().err
+    for name in ("gpu_memory", "max_num_splats", "images_to_load"):  # where it means no limit
+        train.parse(["-s", "absent", f"--{name}", "0"])
 
 
 @pytest.mark.parametrize(

@@ -29,10 +29,9 @@ class Spill(Part):
     name = "spill"
     # fmt: off
     options = Options(optimisation=(
-        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory", above_zero=True,
-            unset="all",
-            help="GiB of the GPU's memory that training may use. SH bands above 0 and their Adam state that do not fit "
-                 "are kept in the host's memory; slower, with the same result"),
+        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
+            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
+                 "not fit are kept in the host's memory; slower, with the same result"),
     ))
     # fmt: on
 

@@ -45,14 +45,7 @@ def test_growth_ends_at_the_limit(colmap_scene, tmp_path):
     # 10 is not above --densify_from_iter, 50 is not below --mcmc_until_iter. Nothing is removed.
     for limit, counts in ((0, [300, 300, 390, 507, 659, 659]), (430, [300, 300, 390, *[430] * 3]), (3, [300] * 6)):
         out = tmp_path / str(limit)
-        _train(
-            colmap_scene,
-            out,
-            *(("--max_num_splats", limit) if limit else ()),
-            *window,
-            "--checkpoint_iterations",
-            *every,
-        )
+        _train(colmap_scene, out, "--max_num_splats", limit, *window, "--checkpoint_iterations", *every)
         assert [len(load_checkpoint(out / f"chkpnt{t}.pth")[0][1]) for t in every] == counts
 
 
