@@ -21,7 +21,7 @@ from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, local, world_offset
 from splatting.findings import Finding, Severity
-from splatting.findings.photo_files import of_blur
+from splatting.findings.photo_files import _same_photos, of_blur
 from splatting.findings.photos import check_photos, hints
 from splatting.findings.scene import check_dataset, findings, tell
 from splatting.sfm.images import find_masks, find_shared_pixels
@@ -401,6 +401,20 @@ def test_photos_that_are_there_twice(sound, tmp_path):
     assert "the same picture belongs to cameras in different places (" in said(info._replace(train_cameras=elsewhere))
     same = [replace(view, image_path=copy) for view in info.train_cameras]
     assert "all 17 photos are the same picture" in said(info._replace(train_cameras=same))
+
+
+def test_photos_that_differ_between_what_is_compared_first_are_two(sound, tmp_path):
+    """Photos without compression of a thing that moves a little share much."""
+    views = []
+    for number, view in enumerate(read(sound).train_cameras[:2]):
+        content = bytearray(4 << 20)
+        content[1 << 20] = number
+        path = tmp_path / f"{number}.bmp"
+        path.write_bytes(content)
+        views.append(replace(view, image_path=path))
+    assert [*_same_photos(views)] == [[0], [1]]
+    views[1].image_path.write_bytes(views[0].image_path.read_bytes())
+    assert [*_same_photos(views)] == [[0, 1]]
 
 
 SCENES = (

@@ -71,7 +71,13 @@ def _same_photos(views: Sequence[CameraInfo]) -> Iterator[list[int]]:
     for size, paths in by_size.items():
         for path, numbers in paths.items():
             by_content[size, _digest(path, size) if len(paths) > 1 else path] += numbers
-    yield from map(sorted, by_content.values())
+    for (size, _), numbers in by_content.items():
+        whole = defaultdict(list)  # photos without compression share much
+        for number in numbers:
+            certain = len(numbers) < 2 or not isinstance(size, int) or size <= 3 * _PART
+            path = Path(views[number].image_path)
+            whole[b"" if certain else hashlib.sha1(path.read_bytes(), usedforsecurity=False).digest()].append(number)
+        yield from map(sorted, whole.values())
 
 
 def _digest(path: str, size: int) -> bytes:
