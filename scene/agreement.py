@@ -16,7 +16,7 @@ import numpy as np
 import pycolmap
 
 from scene.rotation_only import rotation_error
-from scene.unmatched import cover, overlaps, places_of
+from scene.unmatched import find_cover, find_overlaps, places_of
 
 FEWEST = 15  # matches of a pair that is asked
 WORSE = 2.5  # times a pair's own error, beyond which it contradicts,
@@ -60,15 +60,15 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
     """Judge a model by the verified pairs of a database whose focal lengths are calibrated; the result is JSON.
 
     It is `verdict` with what pairs alone do not say. bound: the number of photos that pairs join to one another, those
-    without a pose, too. rotation: rotation_error. alike: photos without which none stands where it shows other things
-    than its neighbours. alike_pair: the clearest pair of these, or none.
+    without a pose, too. rotation: of rotation_error. alike: photos to leave out until no two stand in one place and
+    show different things. alike_pair: the clearest two of these, or None.
     """
-    compared = sorted(overlaps(model, database), key=lambda pair: -pair.empty)
+    compared = sorted(find_overlaps(model, database), key=lambda pair: -pair.empty)
     alike = [pair[:2] for pair in compared if pair.is_unmatched]
     return verdict(list(pairs_of(model, database))) | {
         "bound": len(joined(_linked(database))),
         "rotation": rotation_error(database),
-        "alike": cover(alike),
+        "alike": find_cover(alike),
         "alike_pair": alike[0] if alike else None,
     }
 

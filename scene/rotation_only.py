@@ -20,21 +20,21 @@ _CLIPPED = 0.03  # of the longer side: worse pairs do not decide on the focal le
 
 
 def rotation_error(path: str) -> float | None:
-    """Error that rotations alone leave in the pairs of a database, as a share of the photos' longer side.
+    """Return the error that rotations alone leave in the pairs of a database, as a share of the photos' longer side.
 
     Median over a pair's matches, then 90th percentile over pairs, for the factor of the focal lengths that fits best.
     None: no pair has enough matches through perspective lenses.
     """
-    places, focals, sides = _pairs(path)
+    places, focals, sides = _read_matches(path)
     if not len(places):
         return None
-    errors = np.stack([_errors(places, factor * focals) for factor in _FACTORS]) / sides
+    errors = np.stack([_fit_rotations(places, factor * focals) for factor in _FACTORS]) / sides
     best = np.minimum(errors, _CLIPPED).mean(1).argmin()
     return float(np.percentile(errors[best], _PART))
 
 
-def _errors(places: np.ndarray, focals: np.ndarray) -> np.ndarray:
-    """Median distance (P,), pixels, of matches from where the best rotation of each pair takes them.
+def _fit_rotations(places: np.ndarray, focals: np.ndarray) -> np.ndarray:
+    """Return the median distance (P,), pixels, of matches from where the best rotation of each pair takes them.
 
     places (P, 2, M, 2): pixels from the photos' middles. focals (P, 2).
     """
@@ -53,8 +53,8 @@ def _errors(places: np.ndarray, focals: np.ndarray) -> np.ndarray:
     return np.median(error, axis=1)
 
 
-def _pairs(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places of matches (P, 2, M, 2), pixels from the photos' middles; focal lengths (P, 2); longer sides (P,)."""
+def _read_matches(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Read places of matches (P, 2, M, 2), pixels from the photos' middles, focal lengths (P, 2), longer sides (P,)."""
     database = pycolmap.Database.open(path)
     cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
     images = {image.image_id: cameras[image.camera_id] for image in database.read_all_images()}

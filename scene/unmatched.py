@@ -52,7 +52,7 @@ class Overlap(NamedTuple):
         return self.cells >= _ASKED and self.empty > _SHARE * self.cells
 
 
-def shown(image: pycolmap.Image, order: dict[int, int], points: np.ndarray) -> Shown:
+def collect_shown(image: pycolmap.Image, order: dict[int, int], points: np.ndarray) -> Shown:
     """Return what a photo of a model shows. points: world positions (P, 3). order: by id the row of a point."""
     seen = [(order[place.point3D_id], place.xy) for place in image.points2D if place.has_point3D()]
     numbers = np.array([number for number, _ in seen], np.int64)
@@ -63,14 +63,14 @@ def shown(image: pycolmap.Image, order: dict[int, int], points: np.ndarray) -> S
     return Shown(image, numbers, world, places, np.bincount(cells, minlength=_CELLS**2), nearest)
 
 
-def overlaps(model: pycolmap.Reconstruction, path: str) -> Iterator[Overlap]:
+def find_overlaps(model: pycolmap.Reconstruction, path: str) -> Iterator[Overlap]:
     """Compare photos of a model whose features a database has compared, also without success."""
     database = pycolmap.Database.open(path)
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     order = {number: row for row, number in enumerate(model.points3D)}
     points = np.array([point.xyz for point in model.points3D.values()], float).reshape(-1, 3)
     listed = [image for image in database.read_all_images() if image.name in posed]
-    images = {image.image_id: shown(posed[image.name], order, points) for image in listed}
+    images = {image.image_id: collect_shown(posed[image.name], order, points) for image in listed}
     keypoints = {number: places_of(database.read_keypoints(number)) for number in images}
     verified = dict(zip(*database.read_two_view_geometries(), strict=True))
     database.close()
@@ -83,11 +83,11 @@ def overlaps(model: pycolmap.Reconstruction, path: str) -> Iterator[Overlap]:
             matches = verified[number].inlier_matches if number in verified else none
             places = [keypoints[one][matches[:, k]] for k, one in enumerate(pair)] if len(matches) else [none, none]
             first, second = (images[one] for one in pair)
-            found = np.add(expected(first, second, places[1]), expected(second, first, places[0])).tolist()
+            found = np.add(count_expected(first, second, places[1]), count_expected(second, first, places[0])).tolist()
             yield Overlap(first.image.name, second.image.name, *found)
 
 
-def expected(one: Shown, other: Shown, matched: np.ndarray) -> tuple[int, int]:
+def count_expected(one: Shown, other: Shown, matched: np.ndarray) -> tuple[int, int]:
     """Return the number of cells of the other photo that should have matches with the first, and of those without any.
 
     matched (M, 2): places of matches in the other photo, pixels.
@@ -119,8 +119,8 @@ def expected(one: Shown, other: Shown, matched: np.ndarray) -> tuple[int, int]:
     return int((should | (got > 0)).sum()), int((should & (got == 0)).sum())
 
 
-def cover(pairs: Sequence[tuple[str, str]]) -> list[str]:
-    """Return photos without which none of the pairs is left: each time the one of most pairs."""
+def find_cover(pairs: Sequence[tuple[str, str]]) -> list[str]:
+    """Return photos without which none of the pairs is left (a vertex cover): each time the one of most pairs."""
     left, found = list(pairs), []
     while left:
         counts = Counter(name for pair in left for name in pair)

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scene.rotation_only import rotation_error
-from scene.unmatched import cover, overlaps
+from scene.unmatched import find_cover, find_overlaps
 from splatting.findings.capture import is_folded, is_wrong, only_turned
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 240.0
@@ -126,7 +126,7 @@ def test_a_camera_that_only_turns_is_told_from_one_that_moves(tmp_path, poses, p
 
 
 def _unmatched(model: pycolmap.Reconstruction, path: Path) -> list[str]:
-    return cover([pair[:2] for pair in overlaps(model, str(path)) if pair.is_unmatched])
+    return find_cover([pair[:2] for pair in find_overlaps(model, str(path)) if pair.is_unmatched])
 
 
 def test_rooms_with_one_poster_are_not_the_same_room(tmp_path):
