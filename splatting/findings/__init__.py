@@ -4,7 +4,7 @@ environment          packages, GPU, extensions (imports nothing heavy)
 photos, photo_files  what photos show; photos that are there twice, or blurred
 shared_pixels        parts of nearly all photos that are the same, such as a caption
 cameras, points      where they stand, and what no camera or cloud has
-fit                  whether cameras, points and photos fit together
+fit                  lenses, units and poses that the tracks of structure from motion contradict
 scene                all of these in their order, for doctor.py and before a training
 capture              photos and poses of a conversion, and what to photograph again
 training, resources  before a training and after it; memory and disk

@@ -1,8 +1,4 @@
-"""Points that a training starts from: few, in no photo, far away, several in one place, of other colours than photos.
-
-A photo fits its camera if it shows the colours of the camera's points better than most other photos do. That needs no
-threshold of colour, and holds for any exposure.
-"""
+"""Points that a training starts from: few, in no photo, far away, several in one place."""
 
 from collections.abc import Iterator
 

@@ -51,7 +51,7 @@ def with_way(found: Iterable[Finding], source: str | os.PathLike) -> list[Findin
 
 
 def has_shared_pixels(found: Sequence[Finding]) -> bool:
-    """Return True if findings name pixels that all photos share: these may spoil poses, points and colours."""
+    """Return True if findings name pixels that all photos share: these may spoil poses and points."""
     return any(SHARED_TEXT in one.text for one in found)
 
 
@@ -105,7 +105,7 @@ def check_dataset(source: str, images: str) -> list[Finding]:
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
     found = findings(info, most=MOST_PHOTOS)
     checks += [found, of_blur(info, MOST_PHOTOS)]
-    if not any(of_lenses(info)) and not has_shared_pixels(found):  # else poses and colours have that cause
+    if not any(of_lenses(info)) and not has_shared_pixels(found):  # else poses have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_notes(said.getvalue()), *with_way(chain(*checks, check_conversion(source)), source)]
 
