@@ -28,8 +28,6 @@ _SAYS = {
     FRONT: "Click two points, from left to right, of a line that is to be looked at straight on.",
     NOTE: "Click what a note of an exported page tells of.",
 }
-_TILTED = 8.0  # degrees between the ground and the photos' horizons, above which a mistake is likelier than a slope
-_FLAT = 0.2  # least height of the ground's triangle, in parts of its longest side
 _SIZE, _WIDTH = 0.006, 0.004  # radius of a point and width of a line, by the scene's size
 
 Find = Callable[[Pose, np.ndarray, Callable[[np.ndarray | None], None]], None]
@@ -95,7 +93,7 @@ class MeasureTab:
         gui, self._server, self._cameras, self._find, self._place = server.gui, server, cameras, find, place
         self.points: dict[str, list[np.ndarray]] = {tool: [] for tool in _POINTS}
         self._drawn: list[Any] = []
-        self._eye, self._doubted = np.zeros(3), False
+        self._eye = np.zeros(3)
         self.tool = gui.add_dropdown("Click", TOOLS)
         self.says = gui.add_markdown(_SAYS[OFF])
         hint = "of the length, in metres; 0: not known"
@@ -127,7 +125,7 @@ class MeasureTab:
         if point is None:
             self.says.content = "There is no surface; click another point."
             return
-        self._doubted, self._eye = False, self._eye if eye is None else eye
+        self._eye = self._eye if eye is None else eye
         points = self.points[tool]
         self.points[tool] = [*points, point] if len(points) < _POINTS[tool] else [point]
         self._show()
@@ -187,21 +185,10 @@ class MeasureTab:
         lines = f"camera: {as_utf8(found[0])}\n    at: {found[1][0]:.0f} {found[1][1]:.0f}"
         return f"For `export.py --notes`, below a line `## NAME`:\n\n    {lines}"
 
-    def _check_ground(self, ground: np.ndarray) -> None:
-        """UserError for doubtful points (3,3), the first time."""
-        flat, tilt = np.linalg.norm(ground_normal(ground)) < _FLAT, self._tilt(ground)
-        if self._doubted or not (flat or tilt > _TILTED):
-            return
-        self._doubted = True
-        fault = "its points lie nearly on a line" if flat else f"it is tilted by {tilt:.0f} degrees in the photos"
-        raise UserError(f"the ground is doubtful, as {fault}; click others, or press “Set right” again to keep it")
-
     def write(self) -> list[Path]:
         """Keep what was measured; the files. UserError for what cannot be kept."""
         if self._place is None or self.keep.disabled:
             raise UserError("there is nothing to set right; click the ground, the front, or a length that you know")
-        if (ground := self._whole(GROUND)) is not None:
-            self._check_ground(ground)
         metres = self.metres.value if math.isfinite(self.metres.value) else 0.0
         scale = metres / self.length if self.length and metres > 0 else None
         moved = {tool: None if (it := self._whole(tool)) is None else it + self._place.offset for tool in _POINTS}
