@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from diff_gaussian_rasterization.lens import lens_of
 from gaussians import model, pipeline
 from scipy.spatial.transform import Rotation, Slerp
 
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from scene.cameras import Camera
+from scene.readers.info import CameraInfo
+from scene.readers.tracks import projected
 from splatting.camera_paths.generated import GENERATED, Ellipse, Interpolated, Spiral, visiting_order
 from splatting.camera_paths.keyframes import (
     CameraPath,
@@ -23,7 +26,7 @@ from splatting.camera_paths.keyframes import (
     frame_moment,
     read_camera_path,
 )
-from splatting.camera_paths.poses import Poses, facing, focus_point
+from splatting.camera_paths.poses import Poses, facing, focus_point, ray_through
 from utils.system_utils import UserError
 
 UP = np.array([0.0, -1.0, 0.0])  # of COLMAP's world, as usual captures have it
@@ -314,3 +317,20 @@ def test_cameras_that_a_path_cannot_be_made_of(name, poses, sentence):
     with pytest.raises(UserError, match=rf"^--path {name} needs .*{sentence}") as refused:
         GENERATED[name](poses, 2.0)
     assert "--path" in str(refused.value).partition(";")[2] and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        None,
+        lens_of("OPENCV", (330.0, 340.0, 205.0, 140.0, -0.2, 0.05, 0.01, -0.01)),
+        lens_of("OPENCV_FISHEYE", (150.0, 150.0, 200.0, 150.0, 0.05, -0.01, 0.0, 0.0)),
+    ],
+)
+def test_points_on_the_ray_through_a_place_of_a_photo_are_seen_there(lens):
+    turn, place = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix(), np.array([1.0, 2.0, -3.0])
+    lenses = {"fx": 330.0, "fy": 340.0, "cx": 205.0, "cy": 140.0, "native": lens}
+    info = CameraInfo(0, turn, -turn.T @ place, width=400, height=300, file_size=(800, 600), **lenses)
+    ray = ray_through(Camera(info, (200, 150), 0), 640.0, 120.0)
+    x, y, is_shown = projected(info, (place + 3 * ray / np.linalg.norm(ray))[None])
+    assert is_shown.all() and [*x, *y] == pytest.approx([320, 60], abs=0.03)

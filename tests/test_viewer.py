@@ -8,7 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from diff_gaussian_rasterization.lens import lens_of
 from gaussians import model, parameters, pipeline
 from scipy.spatial.transform import Rotation
 from synthetic import options_of
@@ -18,13 +17,11 @@ from gaussian_renderer.blending import blend_depth
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.median_depth import surface_of
 from scene import Scene
-from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from scene.readers.info import CameraInfo
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
 from splatting.camera_paths.keyframes import read_camera_path
-from splatting.camera_paths.poses import poses_of, ray_through
+from splatting.camera_paths.poses import poses_of
 from splatting.camera_paths.start import best_start
 from splatting.viewer import legend, path_tab, views
 from splatting.viewer.coverage import Coverage, Covered
@@ -199,28 +196,6 @@ def test_the_surface_along_a_ray_is_found_where_there_is_one():
     ray = np.array([0.5, -0.2, 4]) / np.linalg.norm([0.5, -0.2, 4])
     np.testing.assert_allclose(frames.surface(PLAIN, FRONT, ray), [0.5, -0.2, 0], atol=1e-3)
     assert frames.surface(PLAIN, FRONT, np.array([0.0, 0, 1])) is None
-
-
-@pytest.mark.parametrize(
-    "lens",
-    [
-        None,
-        lens_of("OPENCV", (330.0, 340.0, 205.0, 140.0, -0.2, 0.05, 0.01, -0.01)),
-        lens_of("OPENCV_FISHEYE", (150.0, 150.0, 200.0, 150.0, 0.05, -0.01, 0.0, 0.0)),
-    ],
-)
-def test_a_place_in_a_photo_is_that_of_the_points_on_its_ray(lens):
-    turn, place, at = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix(), np.array([1.0, 2.0, -3.0]), (640.0, 120.0)
-    sizes = {"width": 400, "height": 300, "file_size": (800, 600)}
-    lenses = {"fx": 330.0, "fy": 340.0, "cx": 205.0, "cy": 140.0, "native": lens}
-    shown, away = (
-        Camera(CameraInfo(0, turn, -turn.T @ eye, image_name=name, **sizes, **lenses), (200, 150), 0)
-        for name, eye in (("here", place), ("away", place - 9 * turn[:, 2]))
-    )
-    ray = ray_through(shown, *at)
-    name, found = SceneCameras([away, shown], []).place_in_photo(place + 3 * ray / np.linalg.norm(ray), place)
-    assert name == "here" and found == pytest.approx(at, abs=0.05)
-    assert SceneCameras([shown], []).place_in_photo(place - 3 * turn[:, 2], place) is None
 
 
 def test_the_surface_of_a_large_gaussian_is_found_far_from_its_mean():

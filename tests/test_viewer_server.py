@@ -406,9 +406,6 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
         click("The ground", (0, 1, 2))
         assert "tilted by 0." in tab.says.content
         click("The front", (2, 1))
-        click("A note", (3,))  # in the middle of the nearest photo that shows it, a little above
-        camera = page.measure._cameras.by_name["train 0: around 0"]
-        assert f"camera: {camera.image_name}\n    at: 480 " in tab.says.content
         _set(client, tab.keep, True)
         wait_for(lambda: (tmp_path / "scene/orientation.json").is_file() and "5 m" in tab.says.content)
         assert client.until("NotificationShowMessage")["props"]["title"] == "Set right"

@@ -10,7 +10,6 @@ import numpy as np
 from splatting.files.json_files import MODEL_JSON, read_model_json, write_json
 from splatting.files.measured import ground_normal, measured_record
 from splatting.files.similarity import ENTRY, FILE, Similarity, read_orientation, recorded_similarity
-from splatting.host.listing import as_utf8
 from splatting.viewer.tabs import Tell, serialized
 from splatting.viewer.views import Pose, SceneCameras, pose_of
 from utils.system_utils import UserError
@@ -18,15 +17,14 @@ from utils.system_utils import UserError
 if TYPE_CHECKING:
     import viser
 
-OFF, LENGTH, GROUND, FRONT, NOTE = TOOLS = ("Nothing", "A length", "The ground", "The front", "A note")
-_POINTS = {LENGTH: 2, GROUND: 3, FRONT: 2, NOTE: 1}
-_COLOURS = {LENGTH: (255, 200, 0), GROUND: (60, 200, 90), FRONT: (240, 80, 200), NOTE: (80, 160, 255)}
+OFF, LENGTH, GROUND, FRONT = TOOLS = ("Nothing", "A length", "The ground", "The front")
+_POINTS = {LENGTH: 2, GROUND: 3, FRONT: 2}
+_COLOURS = {LENGTH: (255, 200, 0), GROUND: (60, 200, 90), FRONT: (240, 80, 200)}
 _SAYS = {
     OFF: "Choose what to click.",
     LENGTH: "Click the two ends of a length.",
     GROUND: "Click three points of the ground, far from each other.",
     FRONT: "Click two points, from left to right, of a line that is to be looked at straight on.",
-    NOTE: "Click what a note of an exported page tells of.",
 }
 _SIZE, _WIDTH = 0.006, 0.004  # radius of a point and width of a line, by the scene's size
 
@@ -93,7 +91,6 @@ class MeasureTab:
         gui, self._server, self._cameras, self._find, self._place = server.gui, server, cameras, find, place
         self.points: dict[str, list[np.ndarray]] = {tool: [] for tool in _POINTS}
         self._drawn: list[Any] = []
-        self._eye = np.zeros(3)
         self.tool = gui.add_dropdown("Click", TOOLS)
         self.says = gui.add_markdown(_SAYS[OFF])
         hint = "of the length, in metres; 0: not known"
@@ -117,15 +114,13 @@ class MeasureTab:
     async def _clicked(self, event: Any) -> None:
         pose, tool = pose_of(event.client.camera), self.tool.value
         if pose is not None and tool in _POINTS:
-            eye = np.array(pose.position)
-            self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point, eye))
+            self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point))
 
-    def add(self, tool: str, point: np.ndarray | None, eye: np.ndarray | None = None) -> None:
-        """Take a point (3,); a full tool begins anew. None: nothing is there. eye: where it was clicked from."""
+    def add(self, tool: str, point: np.ndarray | None) -> None:
+        """Take a point (3,); a full tool begins anew. None: nothing is there."""
         if point is None:
             self.says.content = "There is no surface; click another point."
             return
-        self._eye = self._eye if eye is None else eye
         points = self.points[tool]
         self.points[tool] = [*points, point] if len(points) < _POINTS[tool] else [point]
         self._show()
@@ -157,8 +152,7 @@ class MeasureTab:
                 lines = f"/measured/{tool}/lines", ends.astype(np.float32), _COLOURS[tool]
                 self._drawn.append(scene.add_line_segments(*lines, thickness=_WIDTH * size))
         scale, unit = self._place.unit if self._place else (1.0, "units")
-        note = self._whole(NOTE) if self.tool.value == NOTE else None
-        self.says.content = _SAYS[self.tool.value] if note is None else self._note(note[0])
+        self.says.content = _SAYS[self.tool.value]
         if self.length is not None:
             said = f"{self.length * scale:.4g} {unit}"
             self.says.content = f"The length is {said}. {self.says.content}"
@@ -176,14 +170,6 @@ class MeasureTab:
         normal = ground_normal(ground)
         cosine = abs(normal @ self._cameras.vertical) / np.linalg.norm(normal).clip(1e-12)
         return math.degrees(math.acos(min(1.0, cosine)))
-
-    def _note(self, point: np.ndarray) -> str:
-        """The lines of a file of notes for a point (3,): the photo nearest to the eye that shows it, and where."""
-        found = self._cameras.place_in_photo(point, self._eye)
-        if found is None:
-            return "No training photo shows this point; click another one."
-        lines = f"camera: {as_utf8(found[0])}\n    at: {found[1][0]:.0f} {found[1][1]:.0f}"
-        return f"For `export.py --notes`, below a line `## NAME`:\n\n    {lines}"
 
     def write(self) -> list[Path]:
         """Keep what was measured; the files. UserError for what cannot be kept."""

@@ -10,8 +10,7 @@ import numpy as np
 
 from gaussian_renderer.free_view import rotation_matrix
 from scene.cameras import Camera
-from scene.readers.info import CameraInfo, up_of
-from scene.readers.tracks import projected
+from scene.readers.info import up_of
 from splatting.camera_paths.poses import facing, focus_point, opening, poses_of, unit
 from splatting.camera_paths.start import best_start
 from splatting.host.listing import as_utf8
@@ -101,7 +100,6 @@ class SceneCameras:
         }
         self.start, self._target, self.up, self.size = "", None, np.array([0.0, -1.0, 0.0]), 1.0
         self._places, self.middle, self.vertical = np.zeros((0, 3)), np.zeros(3), self.up
-        self._train = list(train)
         if self.by_name:
             poses = poses_of([*train, *test])
             self.start = list(self.by_name)[best_start(poses_of(train or test))]
@@ -111,17 +109,6 @@ class SceneCameras:
             self.vertical = up_of(poses.turns)
             offsets = poses.positions - self.middle
             self.size = float(np.linalg.norm(offsets, axis=1).max()) * _MARGIN or 1.0
-
-    def place_in_photo(self, point: np.ndarray, eye: np.ndarray) -> tuple[str, tuple[float, float]] | None:
-        """The training photo nearest to a place (3,) of those that show a point (3,), and where; None: none does."""
-        for row in np.linalg.norm(self._places[: len(self._train)] - eye, axis=1).argsort(kind="stable"):
-            it = self._train[row]
-            size = {"width": it.image_width, "height": it.image_height}
-            lens = {"fx": it.fx, "fy": it.fy, "cx": it.cx, "cy": it.cy, "native": it.lens}
-            x, y, is_shown = projected(CameraInfo(0, it.R, it.T, **size, **lens), point[None])
-            if is_shown:
-                return it.image_name, tuple(np.concatenate([x, y]) * it.photo_size / (it.image_width, it.image_height))
-        return None
 
     def up_at(self, axes: np.ndarray) -> Vector:
         """An upward direction with which a camera with these axes looks as its image does, near that of all.
