@@ -9,10 +9,8 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import gaussian_filter
 
 import train
-from splatting.findings import Finding
 from splatting.findings.capture import left_out, lines_of, neighbours_of, of_model, unusable, worth
 from splatting.findings.photos import SHARED_TEXT
-from splatting.findings.scene import OUT, with_way
 from splatting.sfm import report
 from splatting.sfm.capture import compared, looks_of
 from splatting.sfm.capture_page import write_page
@@ -201,12 +199,3 @@ def test_per_photo_is_not_advised_to_who_has_it():
     words = [_model(25, error=9.0), _model(15, first=25)], photos, dict.fromkeys(photos, 9), "auto", 0, [wrong], 0
     advised = [["per_photo" in line for line in map(str, of_model(*words, mode))] for mode in ("per_lens", "per_photo")]
     assert advised[0].count(True) == 4 and not any(advised[1])
-
-
-def test_who_converted_is_told_how_to_take_photos_out(tmp_path):
-    found = [Finding("2 photos are black", OUT), Finding("else", "wait")]
-    assert with_way(found, tmp_path) == found
-    (tmp_path / "convert_report.json").touch()
-    assert [str(one) for one in with_way(found, tmp_path)] == [
-        "2 photos are black; remove them from input and run convert.py again", "else; wait",
-    ]  # fmt: skip

@@ -5,13 +5,12 @@ import contextlib
 import io
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
 from scene.dataset_readers import SceneInfo, read_scene
 from scene.readers.info import NEAREST, as_camera_info
-from scene.readers.scene_folder import REPORT
 from scene.scene import Scene
 from splatting.findings import Finding, Severity, from_error, note
 from splatting.findings.cameras import check_extent, check_lenses, of_cameras, of_lenses
@@ -24,7 +23,6 @@ from utils.system_utils import UserError
 
 LOOKED_AT = 16  # photos that a training decodes, small,
 MOST_PHOTOS = 100  # and the doctor
-OUT = "take them out of the scene"
 _LINES = 5  # most findings that a training prints
 
 
@@ -44,12 +42,6 @@ def findings(
     return sorted(found, key=lambda one: -one.severity)
 
 
-def with_way(found: Iterable[Finding], source: str | os.PathLike) -> list[Finding]:
-    """Say how photos are taken out of a scene that convert.py made."""
-    made, way = (Path(source) / REPORT).is_file(), "remove them from input and run convert.py again"
-    return [one._replace(remedy=one.remedy.replace(OUT, way)) if made else one for one in found]
-
-
 def has_shared_pixels(found: Sequence[Finding]) -> bool:
     """Return True if findings name pixels that all photos share: these may spoil poses and points."""
     return any(SHARED_TEXT in one.text for one in found)
@@ -57,7 +49,6 @@ def has_shared_pixels(found: Sequence[Finding]) -> bool:
 
 def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:
     """Raise the first finding as a UserError if it is hopeless; print a few as warnings. quiet: print none."""
-    found = with_way(found, source)
     if found and found[0].severity == Severity.HOPELESS:
         raise UserError(str(found[0]))
     if quiet:
@@ -100,14 +91,14 @@ def check_dataset(source: str, images: str) -> list[Finding]:
         with contextlib.redirect_stderr(said):
             info = read_scene(source, images, hold_out=False, native=True)
     except UserError as error:
-        return [*_notes(said.getvalue()), *with_way([from_error(error)], source)]
+        return [*_notes(said.getvalue()), from_error(error)]
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
     found = findings(info, most=MOST_PHOTOS)
     checks += [found, of_blur(info, MOST_PHOTOS)]
     if not any(of_lenses(info)) and not has_shared_pixels(found):  # else poses have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
-    return [*_notes(said.getvalue()), *with_way(chain(*checks, check_conversion(source)), source)]
+    return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
 
 
 def _notes(said: str) -> list[Finding]:
