@@ -24,7 +24,7 @@ from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.findings import Finding, fine, from_error
 from splatting.findings.changes import FITS as BAD_PSNR
-from splatting.findings.changes import LOST, NEAR, of_scene, recorded_psnr, strange_photos, what_changed
+from splatting.findings.changes import LOST, of_scene, recorded_psnr, what_changed
 from splatting.findings.scene import check_dataset
 from splatting.findings.training import LATE_RESET, what_to_try
 from splatting.registry import options_of, tools
@@ -220,12 +220,10 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
         return Finding("the photos themselves are black", "inspect them; if they are transparent, train with -w"), False
     then = recorded_psnr(Path(scene.model_path), scene.loaded_iter)
     good = not black and means.psnr >= max(BAD_PSNR, (then or 0.0) - LOST)
-    changed = None
-    if not good or (then is not None and means.psnr < then - NEAR):
-        changed = what_changed(scene, views, _scored(scene, options), means.psnr, then)
-    elif strange := strange_photos(scene, _scored(scene, options)):  # a few of them leave a good mean
-        return strange, True
-    if good and changed is None:
+    changed = what_changed(scene, _scored(scene, options), means.psnr, then)
+    if good and changed:  # a few other photos leave a good mean
+        return changed, True
+    if good:
         width = max(view.image_width for view in views)
         return fine(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
