@@ -272,11 +272,6 @@ def test_a_model_is_checked_against_the_scene_that_is_given(healthy, model, colm
     assert not any("has its photos" in text for text in problems(check_model(folder, -1, str(moved), "pictures")))
 
 
-def _half_black(gaussians):
-    gaussians._opacity.fill_(5)
-    gaussians._features_dc[::2] = -5
-
-
 def _photograph(folder: Path, change, **options) -> None:
     """Let the photos of a model's scene be its own renders on black, after change(pixels) to them, (H, W, 3) uint8."""
     stored = _options(folder)
@@ -302,18 +297,6 @@ def _mask(scene: Path, mask: np.ndarray) -> None:
         path = scene / "masks" / camera.image_name
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(mask).save(path)
-
-
-def test_a_model_of_the_other_background(model, colmap_scene, monkeypatch):
-    """The photos have alpha, and are transparent where they are black."""
-    monkeypatch.setattr(splatting.findings.model, "_WIDTH", WIDTH)
-    folder = Path(model(_half_black))
-    _photograph(folder, lambda x: np.dstack([x, np.where(x.max(axis=2) > 4, 255, 0).astype(np.uint8)]))
-    assert problems(check_model(str(folder), -1)) == []
-    _options(folder, white_background=True)
-    (line,) = problems(check_model(str(folder), -1))
-    assert "over black it is " in line and "the model was trained on black: set white_background=False" in line
-    assert line.endswith("render without -w")
 
 
 @pytest.mark.slow

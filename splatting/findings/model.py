@@ -46,7 +46,6 @@ FEW_ITERATIONS = 3000
 BEGUN = 200  # iterations, from which on a model is better than one colour
 RESET_INTERVAL = 3000  # the default of --opacity_reset_interval
 FEW_GAUSSIANS = 2000
-_CLEARLY = 3.0  # dB
 _VIEWS = 4
 _WIDTH = 200  # pixels of a view, or fewer where it was trained smaller
 
@@ -228,8 +227,7 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
         return fine(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
-    wrong = _other_background(scene, options, stored, means.psnr)
-    wrong = wrong or changed or next(_wrong_values(of_scene(scene), scene.cameras_extent), None)
+    wrong = changed or next(_wrong_values(of_scene(scene), scene.cameras_extent), None)
     wrong = wrong or next(_late_reset(scene), None)
     wrong = wrong or (_why_black(scene, views, means) if black else Finding("", _why_bad(scene, stored, means)))
     return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
@@ -258,20 +256,6 @@ def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> 
     """Means over the views of which some pixel counts (masks, half images); None if there are none."""
     measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
     return Means(*(float(np.mean(values)) for values in zip(*measured, strict=True))) if measured else None
-
-
-def _other_background(
-    scene: Scene, options: argparse.Namespace, stored: dict[str, Any], score: float
-) -> Finding | None:
-    """Whether photos and renders agree over the other background, black or white; None if not."""
-    white = not options.white_background
-    other_options, other = _load(scene.model_path, stored | {"white_background": white}, scene.loaded_iter)
-    means = _means(_looked_at(other), other, other_options)
-    if means is None or means.psnr < max(BAD_PSNR, score + _CLEARLY):
-        return None
-    name = "white" if white else "black"
-    remedy = f"the model was trained on {name}: set white_background={white} in {scene.model_path}/cfg_args"
-    return Finding(f"over {name} it is {means.psnr:.1f} dB", remedy + ("" if white else ", and render without -w"))
 
 
 def _pipe(scene: Scene) -> argparse.Namespace:
