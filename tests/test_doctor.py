@@ -232,24 +232,14 @@ def filled(**columns: float):
     return lambda gaussians: [getattr(gaussians, f"_{name}").fill_(value) for name, value in columns.items()]
 
 
-def moved(factor: float, offset: float = 0.0):
-    return lambda gaussians: gaussians._xyz.mul_(factor).add_(offset)
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
         (lambda gaussians: gaussians._scaling[5, 1].fill_(np.nan),
          "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
-        (lambda gaussians: gaussians._scaling[:50].fill_(3), "16.7% of the Gaussians are larger than the extent"),
-        (filled(opacity=-7), "renders of the training views are black: the Gaussians are almost transparent -> "),
-        (filled(opacity=3, features_dc=-5), "black: the Gaussians themselves are black -> check whether the training"),
-        (filled(opacity=np.log(0.01 / 0.99)), "100% of the opacities are near 0.01, as a reset leaves them"),
-        (filled(scaling=np.log(1e-9)), "the Gaussians are too small for these cameras: their median size is "),
-        (filled(scaling=np.log(1e4)), "the Gaussians are too large for these cameras: their median size is "),
-        (moved(1, 500), "black: no Gaussian is in view, because the cameras face away -> check the poses"),
-        (moved(1e4), "the positions of the Gaussians spread over "),
-        (moved(1e-4), "the positions of the Gaussians spread over "),
+        (filled(opacity=-7), "renders of the training views are black -> the dataset has problems (only 17 photos): "),
+        (filled(opacity=3, features_dc=-5), "renders of the training views are black -> "),
+        (lambda gaussians: gaussians._xyz.add_(500), "renders of the training views are black -> "),
     ],
 )  # fmt: skip
 def test_models_with_a_fault(model, change, said):
@@ -302,12 +292,12 @@ def _mask(scene: Path, mask: np.ndarray) -> None:
 @pytest.mark.slow
 def test_models_that_have_not_converged(model, monkeypatch):
     lines = check_model(model(), -1)
-    assert "opacities: 0-0.01 0%, 0.01-0.05 0%, 0.05-0.2 100%" in lines[1].text
+    assert lines[1].text.startswith("opacities: median 0.10; sizes: median ")
     assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
     late = model(iteration=20000)
-    assert "the model does not fit these photos" in str(problems(check_model(late, -1)))  # one colour would fit better
-    monkeypatch.setattr(splatting.findings.model, "BEGUN", 30_000)
-    assert "the dataset has problems (only 17 photos)" in str(problems(check_model(late, -1)))
+    assert "dB -> the dataset has problems (only 17 photos)" in str(problems(check_model(late, -1)))
+    monkeypatch.setattr(splatting.findings.model, "check_dataset", lambda *_: [])
+    assert "dB -> check the poses (x right, y down, z forward)" in str(problems(check_model(late, -1)))
 
 
 @pytest.mark.parametrize("halves", [False, True])

@@ -5,16 +5,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from arguments import read_model_json
 from gaussian_renderer.scored_views import ScoredViews
-from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
 from splatting.evaluation.model_folder import curve_of
 from splatting.evaluation.training_log import NAME as LOG
 from splatting.evaluation.training_log import read_log
 from splatting.findings import Finding
 from splatting.host.listing import some
-from splatting.registry import tools
 from utils.image_utils import as_float, psnr
 from utils.system_utils import UserError
 
@@ -23,17 +20,6 @@ FITS = 18.0  # dB of training views; models that converge reach 22 and more
 CLEARLY = 3.0  # dB by which a view fits another photo better than its own
 _SUSPECTS = 12  # views whose photos are looked for among all, those that fit worst
 LOST = 6.0  # dB below the record, from which on something has changed
-
-
-def of_scene(scene: Scene) -> GaussianModel:
-    """The Gaussians of a model but those that a part of its training has put beside the scene."""
-    gaussians, facts = scene.gaussians, read_model_json(scene.model_path)
-    means = gaussians.get_xyz.detach()
-    own = torch.ones(len(means), dtype=torch.bool, device=means.device)
-    for backdrop in tools("backdrop"):
-        if (found := backdrop(facts, means)) is not None:
-            own &= ~found
-    return gaussians if own.all() or not own.any() else gaussians.part(own, gaussians.max_sh_degree)
 
 
 def recorded_psnr(model: Path, iteration: int) -> float | None:
