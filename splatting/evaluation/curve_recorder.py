@@ -296,7 +296,7 @@ class CurveRecorder:
             often += f" ({self._scored_in_part} of them on {len(self._part['test'])} of {len(self._all['test'])} views)"
         self._log.tell(f"Test PSNR measured {often}, {self._spent['scoring']:.1f} s: {self._folder / FIGURE}")
         if advice := peak_advice(self.rows, saved, steady):
-            # Where training overfits, `what_to_try` says more, and one line is printed.
+            # Where training overfits, `check_overfitting` says more, and one line is printed.
             (self._log.keep if gain_since_peak(self.rows) else self._log.advise)(advice)
 
     def _draw(self) -> None:

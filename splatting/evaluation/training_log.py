@@ -15,7 +15,7 @@ from utils.system_utils import UserError, compute_device
 NAME = "train_log.json"
 SHORT = 2000  # iterations; after trainings up to this length, what training says at its end is short
 DEGREES, PERCENT = "pose_degrees", "pose_percent"  # mean correction of refined poses: turn, and part of the extent
-_OTHERS = "loss", "joules", "peak_memory_mib", "wall_seconds", "max_num_splats", "default_budget"
+_OTHERS = "loss", "joules", "peak_memory_mib", "wall_seconds"
 _FINITE = (DEGREES, PERCENT, *_OTHERS)  # if present
 
 
@@ -74,8 +74,7 @@ class TrainingLog:
     so far; `gaussians`; `loss`, a running mean; and for each set tested `<set>_l1`, `<set>_psnr`. Seconds, joules and
     memory include the runs that were resumed. The last record also has
     `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
-    seconds of this process by what they were spent on (training/log.py), `iterations_planned`,
-    `strategy`, and `max_num_splats` or `default_budget` (findings/training.py), and `lines`, said at its end.
+    seconds of this process by what they were spent on (training/log.py), `strategy`, and `lines`, said at its end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """

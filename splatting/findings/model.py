@@ -25,7 +25,7 @@ from splatting.findings import Finding, fine, from_error
 from splatting.findings.changes import FITS as BAD_PSNR
 from splatting.findings.changes import LOST, recorded_psnr, what_changed
 from splatting.findings.scene import check_dataset
-from splatting.findings.training import LATE_RESET, what_to_try
+from splatting.findings.training import LATE_RESET, check_overfitting
 from splatting.registry import options_of, tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
@@ -80,9 +80,9 @@ def _fits(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
 
 
 def check_training(model: Path) -> list[Finding]:
-    """Notes on what the log and the curve of the training suggest to try; none where it has written none."""
+    """Find an overfitting in the log and the curve of the training, if it has written them."""
     try:
-        return what_to_try(curve_of(model), read_log(model / LOG))
+        return [*check_overfitting(curve_of(model), read_log(model / LOG))]
     except UserError as error:
         return [from_error(error)]
 

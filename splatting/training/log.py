@@ -4,9 +4,8 @@ import math
 import time
 from typing import TYPE_CHECKING
 
-from scene.gaussians.density_rules import default_budget
 from splatting.evaluation.error_curve import whole_sets
-from splatting.findings.training import BUDGET, CAP, PLANNED, STRATEGY, what_to_try
+from splatting.findings.training import STRATEGY, check_overfitting
 from splatting.host.clock import wall_seconds
 from splatting.host.progress import Bar
 from splatting.part import Error, Part, overrides
@@ -120,17 +119,13 @@ class Records(Part):
             run.log.add(at.iteration, seconds, run.clock.joules, **values)
 
     def ended(self, error: Error) -> None:
-        """Note how the training was planned, what to try next, and the seconds of this process by their purpose."""
+        """Note the strategy, an overfitting, and the seconds of this process by their purpose."""
         if error is not None:
             return
-        run, log, opt = self._run, self._run.log, self._run.opt
-        options = {PLANNED: opt.iterations, STRATEGY: opt.strategy}
-        if not run.strategy.grows_to:
-            budget = default_budget(run.scene.getTrainCameras())
-            options |= {CAP: opt.max_num_splats} if opt.max_num_splats else {BUDGET: budget}
-        log.note(**options)
+        run, log = self._run, self._run.log
+        log.note(**{STRATEGY: run.opt.strategy})
         log.keep(*run.warnings)
-        log.advise(*map(str, what_to_try(run.rows, log.records)))
+        log.advise(*map(str, check_overfitting(run.rows, log.records)))
         first, spent = run.first_done, run.clock.spent
         seconds = max(self._seconds, log.records[-1]["seconds"] - log.seconds_before)  # perhaps of a later checkpoint
         parts = {"training": seconds, "scoring": 0.0, "saving": 0.0} | spent
