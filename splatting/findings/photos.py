@@ -10,7 +10,7 @@ from PIL import ExifTags, Image, ImageOps
 
 from scene.images.decode import picture_size
 from scene.images.masks import Mask
-from scene.readers.info import CameraInfo, SceneInfo
+from scene.readers.info import CameraInfo
 from splatting.files.image_files import UNREADABLE, open_image
 from splatting.findings import Finding, Severity, fine
 from splatting.findings.photo_files import shrunk
@@ -124,30 +124,11 @@ def find_shared(looks: Sequence[Look]) -> dict[tuple[int, int], np.ndarray]:
     return found
 
 
-def hints(info: SceneInfo, smallest: tuple[int, int], white_background: bool) -> Iterator[Finding]:
-    """What options may cure: images of a training's smallest size (width, height), and transparent ones on black."""
+def check_size(smallest: tuple[int, int]) -> Iterator[Finding]:
+    """Find images of a training's smallest size (width, height) too small."""
     if min(smallest) < SMALL:
         text = f"images of {smallest[0]}x{smallest[1]} pixels are too small to learn from"
         yield Finding(text, "give a larger --resolution")
-    first = info.train_cameras[0]
-    counts = not (getattr(first, "opaque", False) or getattr(first, "ignore_alpha", False))
-    if (
-        info.is_nerf_synthetic
-        and not white_background
-        and counts
-        and first.image_path
-        and _has_alpha(Path(first.image_path))
-    ):
-        text = "transparent parts of the images count as black"
-        yield Finding(text, "with -w they count as white, as in published results of such scenes")
-
-
-def _has_alpha(path: Path) -> bool:
-    try:
-        with open_image(path) as image:
-            return image.mode in ("RGBA", "LA")
-    except UNREADABLE:
-        return False
 
 
 def looks_at(views: Sequence[Any], most: int, has_alpha: bool = True) -> list[Look]:

@@ -17,7 +17,7 @@ from splatting.findings.cameras import check_extent, check_lenses, of_cameras, o
 from splatting.findings.capture import changed_photos, check_conversion, left_out
 from splatting.findings.fit import check_agreement, check_geometry
 from splatting.findings.photo_files import of_blur, of_duplicates
-from splatting.findings.photos import SHARED_TEXT, check_photos, check_views, hints
+from splatting.findings.photos import SHARED_TEXT, check_photos, check_size, check_views
 from splatting.findings.points import check_cloud, of_points
 from utils.system_utils import UserError
 
@@ -69,7 +69,7 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         print(text)
     if not resumed:
         smallest = min((view.image_width, view.image_height) for view in views)
-        found = [*findings(info, options, scene.halves), *hints(info, smallest, options.white_background)]
+        found = [*findings(info, options, scene.halves), *check_size(smallest)]
         tell(found, options.source_path)
     if info.offset.any():
         print(
