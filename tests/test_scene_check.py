@@ -90,8 +90,6 @@ def test_rounded_coordinates_of_maps(kept, step, part):
         (_alpha(0, 0, 0), True, "3 of the 3 photos that were looked at show nothing, as every pixel"),
         (_alpha(1, 1), True, "left out by alpha; save the photos without alpha"),
         (_alpha(255, 0, 255), False, "1 of the 3 photos that were looked at (v1) show nothing"),
-        (_with_photos(COLORS * 0), False, "1 of the 1 photos that were looked at are nearly one colour"),
-        (_with_photos(COLORS, COLORS * 0 + 90), False, "1 of the 2 photos that were looked at (v1) are nearly one"),
     ],
 )  # fmt: skip
 def test_photos(info, severe, text):

@@ -1,4 +1,4 @@
-"""Faults of photos: sizes, photos of which nothing counts, photos of one colour, pixels that all of them share."""
+"""Faults of photos: sizes, photos of which nothing counts, pixels that all of them share."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -21,7 +21,6 @@ from utils.system_utils import UserError
 FEWEST_VIEWS = 20
 _WIDE = 1600  # pixels
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window
-_NARROW = 16  # of 255, which a photo of one colour spans
 _PIXELS = 200  # a side, of what is looked at
 _MOST_DECODED = 25_000_000  # pixels of all photos; a JPEG is decoded at an eighth of its size
 _JPEG = 1 / 6  # cost of its pixels
@@ -89,7 +88,7 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
 
 
 def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True) -> Iterator[Finding]:
-    """Find photos that show nothing or one colour, and pixels that all share; at most `most` photos are decoded.
+    """Find photos that show nothing, and pixels that all share; at most `most` photos are decoded.
 
     has_alpha: whether their alpha counts.
     """
@@ -98,9 +97,6 @@ def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True) -> Ite
         if hidden := [look for look in looks if look.hidden_by == cause]:
             severity = Severity.HOPELESS if len(hidden) == len(looks) else Severity.PROBLEM
             yield Finding(f"{_of(hidden, looks)} show nothing, as every pixel is left out by {cause}", remedy, severity)
-    flat = [look for look in looks if look.seen.any() and look.visible.all() and _range(look).max() < _NARROW]
-    if flat:
-        yield Finding(f"{_of(flat, looks)} are nearly one colour", "take them out of the scene, or restore them")
     yield from check_shared([look for look in looks if not look.hidden_by])
 
 
@@ -174,11 +170,6 @@ def _look(view: Any, has_alpha: bool) -> tuple[Look, float]:
 
 def _rgba(image: Image.Image) -> np.ndarray:
     return shrunk(image, "RGBA" if image.has_transparency_data else "RGB", _PIXELS)
-
-
-def _range(look: Look) -> np.ndarray:
-    """The range (3,) of the colours that count, of 255, without the most extreme ones."""
-    return np.ptp(np.quantile(look.pixels[look.seen], (_SOME, 1 - _SOME), axis=0), axis=0)
 
 
 def _of(part: Sequence[Look], looks: Sequence[Look]) -> str:
