@@ -195,14 +195,13 @@ def test_seconds_of_a_stopped_process_do_not_count():
     assert wall > 3.0 and counted < wall - 2.5
 
 
-def test_the_thread_of_the_clock_ends_with_its_last_user(monkeypatch):
-    monkeypatch.setattr(clock, "_clock", clock._Running())  # without the users of tests before
-    watches = [Stopwatch(), Stopwatch()]
-    thread = clock._clock._thread
-    watches.pop()
+def test_the_thread_of_the_clock_ends_with_its_stopwatch():
+    before = threading.enumerate()
+    watch = Stopwatch()
+    (thread,) = set(threading.enumerate()).difference(before)
     time.sleep(2 * clock._TICK)
     assert thread.is_alive()
-    watches.pop()
+    del watch
     wait_for(lambda: not thread.is_alive())
 
 

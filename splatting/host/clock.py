@@ -36,12 +36,10 @@ def wall_seconds() -> float:
 
 
 class _Running:
-    """Counts seconds in which the process was not stopped. A thread looks at the clock while a user lives."""
+    """Counts seconds in which the process was not stopped, if somebody looks at the clock often enough."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._users: weakref.WeakSet = weakref.WeakSet()
-        self._thread: threading.Thread | None = None
         self._seconds, self._before, self._worked = 0.0, time.monotonic(), _worked()
 
     def seconds(self) -> float:
@@ -52,21 +50,6 @@ class _Running:
                 self._seconds += passed
             self._before, self._worked = now, worked
             return self._seconds
-
-    def tick_for(self, user: object) -> None:
-        with self._lock:
-            self._users.add(user)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._tick, name="ticks", daemon=True)
-                self._thread.start()
-
-    def _tick(self) -> None:
-        while self._thread:
-            time.sleep(_TICK)
-            self.seconds()
-            with self._lock:
-                if not self._users:
-                    self._thread = None
 
 
 def _worked() -> float:
@@ -98,4 +81,10 @@ def running_seconds() -> float:
 
 def tick(user: object) -> None:
     """Let a thread look at the clock while `user` lives: without it, a process that waits seems to be stopped."""
-    _clock.tick_for(user)
+    threading.Thread(target=_look_while, args=(weakref.ref(user),), name="ticks", daemon=True).start()
+
+
+def _look_while(user: weakref.ref) -> None:
+    while user() is not None:
+        time.sleep(_TICK)
+        _clock.seconds()
