@@ -191,13 +191,13 @@ def draw(path: Path, censuses: list[Census], by_case: dict[Case, tuple[Splats, S
 
 @torch.no_grad()
 def main() -> None:
-    args = model_parser(__doc__, figure=True).parse_args()
+    args = model_parser(__doc__).parse_args()
     device = chosen_device(args)
     censuses = []
     for word in args.models:
         model = trained(word, device)
         censuses.append(census(model))
-        print(f"{model.label}: {model.count} Gaussians, {len(model.cameras)} {'' if model.views else 'made '}views")
+        print(f"{model.label}: {model.count} Gaussians, {len(model.cameras)} {'made ' if model.made else ''}views")
     print(describe(device) + "\n")
     by_case = {case: splats for case in CASES if (splats := case_splats(case))}
     print_report(censuses, by_case)

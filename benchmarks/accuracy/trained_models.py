@@ -1,4 +1,4 @@
-"""Trained models for the benchmarks of accuracy: their raw Gaussians and the cameras that look at them."""
+"""Trained models for the census: their raw Gaussians and the cameras that look at them."""
 
 import argparse
 import math
@@ -13,7 +13,6 @@ from arguments import ModelParams, PipelineParams, read_cfg_args
 from benchmarks.harness.measuring import add_device
 from benchmarks.workloads.splat_scenes import COLUMNS, PARAMETERS, on_device, settings
 from gaussian_renderer import rasterizer_settings
-from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved, read_model
 from utils.system_utils import UserError
@@ -26,21 +25,16 @@ class TrainedModel(NamedTuple):
 
     label: str
     gaussians: Gaussians  # raw, float32
-    cameras: list[GaussianRasterizationSettings]  # float64, sorted by the names of their photos
-    views: list[Camera]  # with the photos, one for each camera; none where the cameras are made
+    cameras: list[GaussianRasterizationSettings]
+    made: bool  # the cameras, by `around`
 
     @property
     def count(self) -> int:
         return len(self.gaussians.means)
 
-    def spread(self, count: int) -> list[int]:
-        """Places of so many cameras, or of all there are, evenly over their list."""
-        last = len(self.cameras) - 1
-        return torch.linspace(0, last, min(count, last + 1)).round().long().unique().tolist()
 
-
-def model_parser(doc: str, figure: bool = False) -> argparse.ArgumentParser:
-    """A parser with `models`, whose words `trained` reads, --device, and perhaps --figure."""
+def model_parser(doc: str) -> argparse.ArgumentParser:
+    """A parser with `models`, whose words `trained` reads, --device and --figure."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument(
         "models",
@@ -49,8 +43,7 @@ def model_parser(doc: str, figure: bool = False) -> argparse.ArgumentParser:
         help="folder of train.py (its newest save), a PLY in it, or any PLY, which gets made cameras",
     )
     add_device(parser)
-    if figure:
-        parser.add_argument("--figure", type=Path, help="image file to write")
+    parser.add_argument("--figure", type=Path, help="image file to write")
     return parser
 
 
@@ -64,7 +57,7 @@ def trained(word: str, device: torch.device | str) -> TrainedModel:
         return _of_training(label or folder.name, folder, iteration, device)
     model = read_model(path)
     gaussians = _raw(model, device)
-    return TrainedModel(label or path.stem, gaussians, [on_device(made, device) for made in around(gaussians)], [])
+    return TrainedModel(label or path.stem, gaussians, [on_device(made, device) for made in around(gaussians)], True)
 
 
 def _iteration(ply: Path) -> int:
@@ -79,31 +72,10 @@ def _of_training(label: str, folder: Path, iteration: int, device: torch.device 
     models, pipelines = ModelParams(parser), PipelineParams(parser)
     options = argparse.Namespace(**vars(parser.parse_args([])) | read_cfg_args(folder) | {"model_path": str(folder)})
     scene, pipe = load_saved(models.extract(options), iteration), pipelines.extract(options)
-    views = sorted(scene.getTrainCameras() + scene.getTestCameras(), key=lambda view: view.image_name)
+    views = scene.getTrainCameras() + scene.getTestCameras()
     background = torch.full((3,), float(options.white_background), device=scene.gaussians.get_xyz.device)
-    cameras = [exact(rasterizer_settings(view, scene.gaussians, pipe, background)) for view in views]
-    return TrainedModel(label, _raw(scene.gaussians, device), [on_device(camera, device) for camera in cameras], views)
-
-
-def exact(camera: GaussianRasterizationSettings) -> GaussianRasterizationSettings:
-    """The camera in float64 on the CPU, whose projection and centre follow from its view and tangents without rounding.
-
-    Rounded to float32 they contradict each other by some 1e-7, and an exact image would depend on which one is read.
-    """
-    view = camera.viewmatrix.double().cpu()
-    principal = (torch.linalg.inv(view) @ camera.projmatrix.double().cpu())[2, :2]
-    made = settings(
-        camera.image_width,
-        camera.image_height,
-        view=view.T,
-        principal=tuple(principal.tolist()),
-        fov=2 * math.atan(camera.tanfovx),
-        tan_ratio=camera.tanfovy / camera.tanfovx,
-    )
-    return camera._replace(
-        **{name: getattr(made, name) for name in ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")},
-        bg=camera.bg.double().cpu(),
-    )
+    cameras = [rasterizer_settings(view, scene.gaussians, pipe, background) for view in views]
+    return TrainedModel(label, _raw(scene.gaussians, device), [on_device(camera, device) for camera in cameras], False)
 
 
 def _raw(model: GaussianModel, device: torch.device | str) -> Gaussians:
