@@ -49,12 +49,12 @@ def _save(model: Path, iteration: int, degree: int) -> None:
 def train(words: list[str], _: dict[str, str]) -> None:
     """Numbers depend on the options.
 
-    --sparse_depth is what it adds to the PSNR of seed 0, and twice that to seed 1. With --time_budget it ends three
-    iterations later than with --iterations, and three more for each seed above 0. A file `broken` in the scene folder
-    makes it fail, `full` makes it fail and leave a checkpoint, `slow` makes it wait for a signal.
+    With --time_budget it ends three iterations later than with --iterations, and three more for each seed above 0. A
+    file `broken` in the scene folder makes it fail, `full` makes it fail and leave a checkpoint, `slow` makes it wait
+    for a signal.
     """
     args = _parsed(words, iterations=30000, sh_degree=3, seed=0, time_budget=0.0, start_checkpoint=None,
-                   save_iterations=[7000, 30000], sparse_depth=0.0)  # fmt: skip
+                   save_iterations=[7000, 30000])  # fmt: skip
     end = args.iterations + (3 + 3 * args.seed if args.time_budget else 0)
     _note(args, "train", words)
     args.m.mkdir(parents=True, exist_ok=True)
@@ -66,7 +66,7 @@ def train(words: list[str], _: dict[str, str]) -> None:
     if (args.s / "slow").exists() and not args.start_checkpoint:
         _wait_for_a_signal(args)
 
-    best = 20.0 + args.sh_degree + 0.1 * args.seed + args.sparse_depth * (1 + args.seed)  # dB at the end
+    best = 20.0 + args.sh_degree + 0.1 * args.seed  # dB at the end
     slowness = 1 + args.sh_degree  # seconds an iteration, times ten
     scores = ",".join(f"{views}_{score}" for views in ("test", "train") for score in ("l1", "psnr", "ssim"))
     rows = [f"iteration,seconds,wall_seconds,gaussians,peak_memory_mib,{scores}"]

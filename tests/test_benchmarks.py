@@ -8,19 +8,14 @@ from pathlib import Path
 
 import pytest
 import stand_ins
-from pycolmap import Reconstruction
 from torch.profiler import ProfilerActivity, profile
 
-import full_eval
 import train
 from benchmarks.accuracy import hashes, oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps
-from benchmarks.scenes import conversion, scores
-from benchmarks.scenes.thinned import thinned
-from scene.dataset_readers import read_scene
-from scene.point_depths import HELD_OUT
+from benchmarks.scenes import conversion
 from splatting.evaluation.configs import read_configs
 from utils.system_utils import UserError
 
@@ -52,44 +47,6 @@ def test_an_iteration_makes_few_calls(colmap_scene, tmp_path):
 def _rows(said: str, first: str) -> list[list[str]]:
     lines = [line for line in said.splitlines() if line.startswith(f"| {first}")]
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
-
-
-def test_a_thinned_scene_trains_on_every_third_photo(colmap_scene, tmp_path):
-    whole = read_scene(colmap_scene, "images", hold_out=True)
-    few = read_scene(thinned(colmap_scene, tmp_path / "few", 3), "images", hold_out=True)
-    by_name = lambda views: sorted(views, key=lambda view: view.image_name)  # noqa: E731
-    for found, given in (
-        (few.train_cameras, by_name(whole.train_cameras)[::3]),
-        (few.test_cameras, by_name(whole.test_cameras)[:1]),
-    ):
-        assert [Path(view.image_path).resolve() for view in by_name(found)] == [
-            Path(view.image_path).resolve() for view in given
-        ]
-    points = (tmp_path / "few/sparse/0/points3D.txt").read_text().splitlines()
-    known = Reconstruction(str(colmap_scene / "sparse/0")).num_points3D()
-    assert len(points) == known - -(-known // HELD_OUT)
-
-
-def test_models_are_scored_again_with_other_options_of_render(tmp_path, monkeypatch, capsys):
-    scene, out = tmp_path / "attic", tmp_path / "out"
-    (scene / "sparse").mkdir(parents=True)
-    sets = tmp_path / "sets.json"
-    sets.write_text('{"none": [], "deep": ["--sparse_depth", "0.5"]}')
-    words = f"--scenes {scene} --output_path {out} --iterations 40 --seeds 0 1 --configs {sets}"
-    monkeypatch.setattr(full_eval, "facts_asked", dict)
-    full_eval.main(words.split(), stand_ins.run)
-    monkeypatch.setattr(scores, "run_child", stand_ins.run)
-    capsys.readouterr()
-    monkeypatch.setattr(sys, "argv", f"scores {out} -- --depth -r 34".split())
-    scores.main()
-    calls = [json.loads(line) for line in (tmp_path / "calls.txt").read_text().splitlines()]
-    assert [words[-3:] for words in calls if words[0] == "render"][4:] == [["--depth", "-r", "34"]] * 4
-    none, deep = _rows(capsys.readouterr().out, "attic")
-    assert (none[1:3], none[-1]) == (["none", "23.05"], "+0.00 (0.00)")
-    assert (deep[1:3], deep[-1]) == (["deep", "23.80"], "+0.75 (0.35)")  # the stand-in adds more to the second seed
-    monkeypatch.setattr(sys, "argv", ["scores", str(tmp_path)])
-    with pytest.raises(UserError, match="has no report of full_eval.py"):
-        scores.main()
 
 
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[1] / "benchmarks/sets").glob("*.json")), ids=str)

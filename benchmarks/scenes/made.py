@@ -19,7 +19,7 @@ from splatting.demo.make_scene import make_scene
 from splatting.demo.objects import Box, Sphere, Thing, backdrop_texture, demo_scene, marble
 from utils.system_utils import UserError, run_cli
 
-VIEWS, _POINTS, _SIZE = 48, 8000, (240, 180)
+_VIEWS, _POINTS, _SIZE = 48, 8000, (240, 180)
 _BALLS = 3  # in a photo
 _STOPS, _BALANCE, _FALLOFF = 1.0, 0.15, 0.5  # largest exposure; deviation of a channel, stops; (tan of the corner)^2
 _SKY = 1e4  # units away, where the cameras stand within four of each other
@@ -64,7 +64,7 @@ MADE = {
 
 def made(name: str, out: Path) -> Path:
     """Write the scene of a name of MADE."""
-    make_scene(out, VIEWS, *size(name), _POINTS, seed=0, **MADE[name])
+    make_scene(out, _VIEWS, *((384, 192) if name == "panorama" else _SIZE), _POINTS, seed=0, **MADE[name])
     if name == "exposure":
         photos = sorted((out / "images").iterdir())
         expose([path for k, path in enumerate(photos) if k % HOLD])
@@ -106,10 +106,6 @@ def expose(photos: list[Path]) -> None:
         light = np.minimum(light * gain / (1 + _FALLOFF * square[..., None]) ** 2, 1)
         pixels = np.where(light > 0.0031308, 1.055 * light ** (1 / 2.4) - 0.055, 12.92 * light)
         Image.fromarray(np.floor(255 * pixels + 0.5).astype(np.uint8)).save(path)
-
-
-def size(name: str) -> tuple[int, int]:
-    return (384, 192) if name == "panorama" else _SIZE
 
 
 def main() -> None:
