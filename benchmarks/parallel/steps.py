@@ -3,7 +3,6 @@
     python -m benchmarks.parallel.steps --ranks 1 2
     python -m benchmarks.parallel.steps --ranks 1 2 --workload city --gaussians 5000000 10000000 20000000
     python -m benchmarks.parallel.steps --workload city --crop 3 --model sleep spill --learn --cap 16
-    python -m benchmarks.parallel.steps --ranks 1 2 --workload city --model sleep --rounds 1 --kernels
 
 A step is that of train.py: draw, loss against a photo, Adam. XL is the workload of the other benchmarks; city has 20 M
 Gaussians at 3840x2160, a plane of blocks seen from above, which each rank draws for itself. Every combination of the
@@ -15,7 +14,6 @@ of all parameters after the last step, by rank. The last step of a training need
 gradients as steps do that add or remove Gaussians. Several numbers of Gaussians give the bytes of one, by a line
 through the least and the largest, and how many fit into 92 % of the GPUs. The model `spill` trains with --gpu_memory
 of the cap, and blocks sleep, as in `sleep`; shown is the share of SH bands above 0 that the host's memory then has.
-With --kernels a second table has the milliseconds of a step's kernels on the first rank, from a block of its own.
 """
 
 import argparse
@@ -34,7 +32,6 @@ from typing import Any
 import torch
 
 from benchmarks.harness.measuring import describe, print_table
-from benchmarks.parallel.kernels import Kernels, kernel_rows
 from benchmarks.parallel.run import WorkloadRun
 from benchmarks.parallel.workload import ALL
 from scene.gaussian_model import GaussianModel
@@ -100,21 +97,18 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
         torch.cuda.set_per_process_memory_fraction(min(case["cap"] * 2**30 / total, 1.0))
     workload = replace(ALL[case["workload"]].changed(case["gaussians"], case["size"]), crop=case["crop"])
     timed = case["warm_up"] + _BLOCK * case["blocks"]
-    steps = timed + _BLOCK * case["kernels"] + 1
     model = {"sleep": case["model"] != "gpu", "gpu_memory": case["cap"] * spills}
-    run = WorkloadRun(workload, steps, still=not case["learn"], **model)
+    run = WorkloadRun(workload, timed + 1, still=not case["learn"], **model)
     if device.type == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
     timing = Timing(device, case["warm_up"], timed)
-    profiled = [Kernels(timed + 1, _BLOCK)] * case["kernels"]
     run.open()
-    run_training(run, [run.watch, timing, *profiled])
+    run_training(run, [run.watch, timing])
     near, far = bytes_of()
     peaks = timing.peak_mib, peak_memory_mib(device) or 0.0
     own = {"ms": timing.milliseconds} | dict(zip(("peak", "last"), (mib + near / 2**20 for mib in peaks), strict=True))
     own["far"] = far / (near + far) if far else 0.0
-    own["kernels"] = profiled[0].milliseconds if profiled else {}
     own["digest"] = digest(run.gaussians) if case["learn"] else ""
     own["memory"] = torch.cuda.mem_get_info()[1] if device.type == "cuda" else 0
     count = workload.gaussians
@@ -178,7 +172,7 @@ def bytes_each(results: list[dict[str, Any]]) -> list[str]:
 
 def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Every combination of the options."""
-    same = {name: getattr(args, name) for name in ("size", "crop", "cap", "learn", "warm_up", "blocks", "kernels")}
+    same = {name: getattr(args, name) for name in ("size", "crop", "cap", "learn", "warm_up", "blocks")}
     return [
         same | {"workload": workload, "gaussians": count, "ranks": number, "model": model}
         for workload in args.workload
@@ -201,7 +195,6 @@ def options() -> argparse.ArgumentParser:
         help="where it lies, and whether blocks sleep (default: gpu)")  # fmt: skip
     add("--cap", type=float, default=0.0, help="GiB of a GPU that a process may take (default: all)")
     add("--learn", action="store_true", help="train, and show digests of the parameters")
-    add("--kernels", action="store_true", help="show the times of kernels, too")
     add("--warm_up", type=int, default=24, help="steps (default: 24)")
     add("--blocks", type=int, default=20, help=f"of {_BLOCK} steps each (default: 20)")
     add("--rounds", type=int, default=2, help="turns of each case (default: 2)")
@@ -229,12 +222,7 @@ def main() -> None:
         first = next((one for one in best if found and one and one["name"] == found["name"]), None)
         rows.append(row(case, found, first))
     print_table(HEADER + ["parameters"] * args.learn, rows)
-    done = [found for found in best if found]
-    if args.kernels and done:
-        print()
-        names = [f"{found['name']}, {found['ranks']}, {found['model']}" for found in done]
-        print_table(["ms a step", *names], kernel_rows([found["by_rank"][0]["kernels"] for found in done]))
-    print("\n".join(bytes_each(done)))
+    print("\n".join(bytes_each([found for found in best if found])))
 
 
 if __name__ == "__main__":
