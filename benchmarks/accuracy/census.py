@@ -28,7 +28,8 @@ from benchmarks.accuracy.splat_shapes import Histogram, Sorted, Splats, axes_of,
 from benchmarks.accuracy.trained_models import TrainedModel, model_parser, trained
 from benchmarks.harness.measuring import chosen_device, describe, print_table
 from benchmarks.workloads.stability_cases import CASES, Case
-from utils.system_utils import UserError, atomic_write, run_cli
+from splatting.evaluation.figures import save_figure
+from utils.system_utils import UserError, run_cli
 
 SHARES = (0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0)
 AXES = {
@@ -185,8 +186,7 @@ def draw(path: Path, censuses: list[Census], by_case: dict[Case, tuple[Splats, S
     panels[5].axis("off")
     handles, labels = panels[0].get_legend_handles_labels()
     panels[5].legend(handles, labels, fontsize="small", loc="upper left")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=80, metadata={"Software": None})
+    save_figure(figure, path, 80)
 
 
 @torch.no_grad()

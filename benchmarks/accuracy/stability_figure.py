@@ -21,7 +21,8 @@ from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK
 from benchmarks.accuracy.stability import ROUNDING, Judged, Result
 from benchmarks.harness.measuring import describe
 from benchmarks.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
-from utils.system_utils import atomic_write, run_cli
+from splatting.evaluation.figures import save_figure
+from utils.system_utils import run_cli
 
 TEXTBOOK_DOUBLE = TEXTBOOK._replace(name="textbook float64", dtype=torch.float64)
 BACKENDS = (CPU_FLOAT, CPU_DOUBLE, TEXTBOOK, TEXTBOOK_DOUBLE)
@@ -94,8 +95,7 @@ def draw(path: Path, measured: dict[str, list[dict]], title: str) -> None:
         panels[-1][column].set_xlabel(name)
     panels[0][0].legend(fontsize="small")
     figure.suptitle(f"Error against condition, for stiff Gaussians\n{title}", fontsize=10)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=100, metadata={"Software": None})
+    save_figure(figure, path, 100)
 
 
 def main() -> None:

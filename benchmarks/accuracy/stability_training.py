@@ -21,7 +21,6 @@ from diff_gaussian_rasterization.reference import blend
 from diff_gaussian_rasterization.reference.camera import RAY_LIMIT, camera_of, project
 from diff_gaussian_rasterization.reference.colour import seen_colors
 from diff_gaussian_rasterization.reference.shape import activated, compensation, project_shapes, radii
-from PIL import Image
 from torch import Tensor
 from tqdm import tqdm
 
@@ -30,8 +29,9 @@ from benchmarks.harness.measuring import describe, print_table
 from benchmarks.workloads import textbook
 from benchmarks.workloads.stability_cases import Parameters
 from benchmarks.workloads.stiff_trainings import EXTENT, HEIGHT, KINDS, VIEWS, WIDTH, Cameras, draw, problem
+from splatting.evaluation.figures import save_figure
 from utils.loss_utils import photometric_loss
-from utils.system_utils import atomic_write, run_cli
+from utils.system_utils import run_cli
 
 STEPS, EVERY = 320, 20
 SINGULAR = 1e5  # condition on the image before dilation: xx yy - xy xy would keep two digits in float32
@@ -180,11 +180,7 @@ def draw_figure(path: Path, found: dict[str, dict[str, Training]]) -> None:
             if other is not None:
                 panel.plot(ends, other, color=f"C{number}", linestyle="--", linewidth=0.9)
     panels[0].legend(fontsize="small")
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=60, metadata={"Software": None})
-        with Image.open(temporary) as drawn:  # lines and text need few colours
-            small = drawn.convert("RGB").quantize(64)
-        small.save(temporary, "PNG", optimize=True)
+    save_figure(figure, path, 60)
 
 
 def main() -> None:

@@ -20,7 +20,8 @@ from pathlib import Path
 from statistics import fmean
 
 from splatting.evaluation.error_curve import PEER_REQUIRED, read_peer
-from utils.system_utils import UserError, atomic_write, run_cli
+from splatting.evaluation.figures import save_figure
+from utils.system_utils import UserError, run_cli
 
 OURS, PEERS = ("#0072B2", "#009E73", "#CC79A7"), "0.25"  # Okabe and Ito's colours
 LINES = ("-", "--", ":", "-.", (0, (6, 1, 1, 1, 1, 1)))
@@ -107,8 +108,7 @@ def main() -> None:
     axes.xaxis.set_major_formatter("{x:g}")
     axes.grid(True, which="both", alpha=0.3, linewidth=0.5)
     axes.legend(fontsize=9, loc="lower right")
-    with atomic_write(args.png) as temporary:
-        figure.savefig(temporary, dpi=140, metadata={"Software": None})
+    save_figure(figure, args.png, 140)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,8 @@ from benchmarks.peers.time_to_target import (
     times,
 )
 from splatting.evaluation.error_curve import NAME, read_peer
-from utils.system_utils import UserError, atomic_write, mkdir_p, run_cli
+from splatting.evaluation.figures import save_figure
+from utils.system_utils import UserError, mkdir_p, run_cli
 
 LINES = ("-", "--", ":")  # with ten colours for thirty programs
 MARGIN = 1.15  # of the axis of x, as a factor
@@ -98,8 +99,7 @@ def draw(path: Path, panels: Mapping[str, Mapping[str, Steps]], x: str, y: str) 
     figure.axes[0].set_ylabel(y)
     handles = figure.axes[0].get_legend_handles_labels()
     figure.legend(*handles, loc="outside lower center", ncols=2 * len(panels), fontsize=9)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=140, metadata={"Software": None})
+    save_figure(figure, path, 140)
 
 
 def main() -> None:

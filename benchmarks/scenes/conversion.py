@@ -30,8 +30,9 @@ from PIL import Image
 
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.captures import make, restricted
+from splatting.evaluation.figures import save_figure
 from splatting.evaluation.model_folder import curve_of
-from utils.system_utils import UserError, atomic_write, run_cli
+from utils.system_utils import UserError, run_cli
 
 if TYPE_CHECKING:
     import pycolmap
@@ -318,8 +319,7 @@ def draw(path: Path, labels: Sequence[list[str]], results: Sequence[Result]) -> 
     axes.invert_yaxis()
     axes.set_xlabel("seconds")
     figure.legend(loc="outside upper center", ncols=len(STAGES), fontsize=8, frameon=False)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, dpi=100, metadata={"Software": None})
+    save_figure(figure, path, 100)
 
 
 def main() -> None:

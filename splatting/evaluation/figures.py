@@ -104,7 +104,8 @@ def _figure(rows: int, size: tuple[float, float], title: str) -> tuple[Figure, A
     return figure, figure.subplots(rows, 1, sharex=True)
 
 
-def _save(figure: Figure, path: str | os.PathLike, dpi: int = 120) -> None:
+def save_figure(figure: Figure, path: str | os.PathLike, dpi: int = 120) -> None:
+    """Write a figure, whole or not at all. Its bytes do not tell the version of matplotlib."""
     with atomic_write(path) as temporary:
         figure.savefig(temporary, dpi=dpi, metadata={"Software": None})
 
@@ -138,7 +139,7 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
     _label(lower, "seconds of training, without scoring and saving", "1 - SSIM", log=True)
     for axes, below in ((upper, -0.05), (lower, -0.2)):  # the label of the lower axis is between
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, below), ncols=2, frameon=False)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _shade_gap(axes: Axes, rows: Sequence[Row], end: Sequence[Row], value: Value, unit: str, views: int) -> None:
@@ -168,7 +169,7 @@ def _panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Cal
         legend = figure.legend(handles, names, title=said, loc="outside lower center", ncols=columns, fontsize=FONT - 2,
                                title_fontsize=FONT - 2, frameon=False)  # fmt: skip
         legend.get_title().set_multialignment("center")
-        _save(figure, path, DPI)
+        save_figure(figure, path, DPI)
     return path
 
 
@@ -271,7 +272,7 @@ def draw_cameras(folder: Path, scene: str, splits: Mapping[str, Sequence[Any]]) 
             axes.set(aspect="equal", adjustable="datalim", xticks=[], yticks=[])
             figure.legend(loc="outside lower center", ncols=2, frameon=False)
             paths.append(folder / f"{scene}_cameras_{number}.png")
-            _save(figure, paths[-1], DPI)
+            save_figure(figure, paths[-1], DPI)
     return paths
 
 
