@@ -87,10 +87,6 @@ class FusedAdam:
         the step. awake: of scene/sleeping.py, None: all are.
         """
         gaussians, view, *options = scene.lists
-        model = self._gaussians
-        if model.drawn is not None:
-            raw = model.raw("opacity").detach(), model.raw("scaling").detach()
-            gaussians += [*raw, model.drawn.chain(*raw, scene.opacities, scene.scales)]
         view = view if awake is None else (*view, awake)
         # By place: names would cost the operator microseconds.
         arguments = source, planes, [], radii, *self.arguments(observe, camera), now, absolute
@@ -109,7 +105,7 @@ class FusedAdam:
     def places(self) -> tuple[int, ...]:
         """Number of Gaussians, and where all tensors of a step lie, to see whether one was replaced."""
         tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
-        tensors += [*self._statistics(), *self._gaussians.columns.values()]
+        tensors += self._statistics()
         return len(self._gaussians), *[tensor.data_ptr() for tensor in tensors]
 
     @property

@@ -9,13 +9,12 @@ import re
 from pathlib import Path
 
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.attributes import Rows
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, unpack
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.morton import sort_scattered
 from scene.gaussians.ply import read_ply
 from scene.scene import Scene
-from splatting.registry import states_in, tools
+from splatting.registry import states_in
 from utils.system_utils import UserError, saved_iterations, saved_ply
 
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
@@ -51,7 +50,8 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
         capture, _ = load_checkpoint(path)
         degree = _degree(capture[3].shape[1])  # of f_rest
         gaussians = GaussianModel(degree if sh_degree is None else sh_degree)
-        rows = _drawn(unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows, capture)
+        states_in(extra_state(capture))  # UserError for a part that is gone: it may have changed what is drawn
+        rows = unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows
     else:
         rows = read_ply(path, sh_degree)
         gaussians = GaussianModel(_degree(rows["f_rest"].shape[1]))
@@ -59,14 +59,6 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
     gaussians.take_whole(rows)
     gaussians.active_sh_degree = gaussians.max_sh_degree
     return gaussians
-
-
-def _drawn(rows: Rows, capture: tuple) -> Rows:
-    """A checkpoint's rows as its PLY would have them."""
-    states = states_in(extra_state(capture))
-    for drawn in tools("drawn"):
-        rows = drawn(rows, states)
-    return rows
 
 
 def _degree(coefficients: int) -> int:

@@ -22,7 +22,6 @@ from scene.splats.ply import columns_of
 from scene.splats.reading import is_point_cloud, read_splats
 from scene.splats.splats import Splats, base_colors, drawable, selected
 from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
-from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -30,12 +29,8 @@ from utils.system_utils import UserError
 @torch.no_grad()
 def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
     """The Gaussians of a model, on the CPU. Other activations than ours are undone, as files hold logits and logs."""
-    if gaussians.kernels_activate:
-        raw = gaussians.raw_geometry()
-        scales, logits = raw["scales"], raw["opacities"]
-    else:
-        scales, logits = gaussians.get_scaling.log(), inverse_sigmoid(gaussians.get_opacity)
-    values = (gaussians.get_xyz, scales, gaussians.get_rotation, logits[:, 0], gaussians.get_features)
+    shapes = gaussians.log_scales(), gaussians.get_rotation, gaussians.opacity_logits()[:, 0]
+    values = (gaussians.get_xyz, *shapes, gaussians.get_features)
     means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
     return Splats(means, scales, rotations, logits, sh, antialiasing, gaussians.world_offset, gaussians.enlargement)
 

@@ -17,7 +17,7 @@ opened       The log is open, and files may be written. What must be closed goes
 terms        In each iteration, before its step: what it adds to the loss.
 begins, due, measured, stepped, ended
              What observers see. The core's own (splatting/training/loop.py) are parts without a name.
-changes      Asked in each iteration: whether rows, sizes or what is drawn will change in it.
+changes      Asked in each iteration: whether rows or sizes will change in it.
 after_step   The optimiser has taken its step.
 records      A record of the log is written, or a point of the curve.
 state        A checkpoint is written. It keeps the state by the part's name, and gives it back to `begin`.
@@ -28,8 +28,6 @@ load, scored A saved model is loaded, and its test views are to be scored or ren
 What only one part can give is a slot of the run or of the model, with a neutral default that the part replaces in
 `begin`, or earlier; a second one that does so is refused by `fill`:
 
-model.drawn  what raw opacities and scales are drawn as, and its chain backward; model.columns keeps values per row.
-             Then every step concerns all rows, and none may sleep.
 model.exposures what photos make of renders, trained with the Gaussians (scene/gaussians/exposure.py)
 model.pinned which Gaussians density control leaves where they are, and as large as they are
 model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/spilled.py)
@@ -42,6 +40,8 @@ run.pixel_filter  which pixels of a view count in its loss. It may learn by rend
 run.has_new_photos  whether the scene has more photos than the checkpoint was trained on
 run.camera_steps  takes the steps of cameras, by the gradients of their numbers, on the host: `place`, `step`,
              `independent`
+
+Values per row, which move with the rows, lie in model.columns.
 """
 
 import argparse

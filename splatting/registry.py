@@ -27,7 +27,6 @@ PARTS = (
     "sky",
     "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
     "ppisp",
-    "filter_3d",  # after all that moves rows
     "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
     "sleep",  # after all that decides whether every step concerns all rows
     "tensorboard",  # from here on, those that only watch
@@ -125,8 +124,7 @@ def tools(name: str) -> list[Callable]:
     advise(scene, tracks): findings on a scene, and options of train.py that they speak for.
     backdrop(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
     advise_trained(scene, views): as advise, by a short training. examine(scene, views): notes of doctor.py.
-    drawn(rows, states): rows of a checkpoint as its PLY would have them. for_wrong_poses(best),
-    for_few_iterations(count): remedies.
+    for_wrong_poses(best), for_few_iterations(count): remedies.
     pictures(model): files in a model folder that reports show, where they are there.
     prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.
     """

@@ -123,9 +123,10 @@ def test_every_flag_shown_is_known(program):
 def test_every_flag_in_prose_is_known():
     known = frozenset().union(FOREIGN, *map(_flags, PROGRAMS))
     texts = {_name(page): _prose(page) for page in PAGES}
-    texts["CHANGELOG.md"] = re.sub(r"(?ms)^### Removed$.*?(?=^##)", "", texts["CHANGELOG.md"])
+    removed = "".join(re.findall(r"(?ms)^### Removed$.*?(?=^##)", texts["CHANGELOG.md"]))
+    gone = {("CHANGELOG.md", flag) for flag in re.findall(r"`(--\w+)", removed)}
     shown = {(name, flag) for name, text in texts.items() for flag in re.findall(r"`(--[a-z]\w+)[^`]*`", text)}
-    assert {(name, flag) for name, flag in shown if flag not in known} == set()
+    assert {(name, flag) for name, flag in shown if flag not in known} <= gone
 
 
 def test_links_resolve_in_the_repository():

@@ -87,7 +87,6 @@ OPTIONS = [
     ["--sparse_depth", 0.3],
     ["--refine_poses", "--sparse_depth", 0.3],
     ["--projection", "ray"],
-    ["--filter_3d"],
 ]
 
 

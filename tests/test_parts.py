@@ -190,9 +190,9 @@ def test_without_half_of_the_parts_a_training_has_the_bytes_of_one_with_them_off
     assert _trained(scene, tmp_path / "out", strategy, ",".join(hidden)) == ply.read_bytes()
 
 
-@pytest.mark.parametrize("key", ["keep_best", "best"])
-def test_a_state_of_no_part_is_refused_by_its_name(key):
-    with pytest.raises(UserError, match="the checkpoint has a state of keep_best, which this code does not have"):
+@pytest.mark.parametrize(("key", "name"), [("keep_best", "keep_best"), ("best", "keep_best"), ("filter_3d",) * 2])
+def test_a_state_of_no_part_is_refused_by_its_name(key, name):
+    with pytest.raises(UserError, match=f"the checkpoint has a state of {name}, which this code does not have"):
         states_in({key: {}})
 
 

@@ -26,7 +26,7 @@ SETS = {
     "halves": ("--train_test_exp", "--masks", "masks", "--antialiasing", "--projection", "ray"),
     "affine": (
         *("--appearance", "affine", "-d", "depths", "--prune_sh", 0),
-        *("--lenses", "native", "--filter_3d", "--antialiasing", "--optimizer_type", "sparse_adam"),
+        *("--lenses", "native", "--antialiasing", "--optimizer_type", "sparse_adam"),
     ),
     "ppisp": ("--appearance", "ppisp", "--sparse_depth", 0.5, "--lenses", "undistort", "--masks", "masks"),
     "poses": ("--refine_poses", "--robust_mask", 0.2, "--sky", "auto", "--strategy", "budget", "--images_to_load", 5),

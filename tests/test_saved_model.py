@@ -16,7 +16,6 @@ import render
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
 from scene.saved_model import find_save, read_model
 from splatting.host.start import typed_command
-from splatting.parts.filter_3d import Smoothing
 from splatting.training.iteration import Iteration
 from utils.system_utils import UserError
 
@@ -59,19 +58,12 @@ def test_both_kinds_have_the_same_gaussians(tmp_path):
         read_model(tmp_path / "chkpnt7.pth", 3)
 
 
-def test_a_checkpoint_is_shown_behind_its_3d_filter(tmp_path):
-    gaussians = model(5, degree=2)
-    gaussians.columns["filter_3d"], gaussians.drawn = torch.rand(5, 1), Smoothing(gaussians)
-    capture = with_extra_state(gaussians.capture(), {"filter_3d": gaussians.columns["filter_3d"]})
-    save_checkpoint(tmp_path / "chkpnt7.pth", capture, 7)
-    gaussians.save_ply(tmp_path / "point_cloud.ply")
-    of_ply, of_checkpoint = (parameters(read_model(tmp_path / name)) for name in ("point_cloud.ply", "chkpnt7.pth"))
-    for name, values in of_ply.items():
-        assert torch.equal(values, of_checkpoint[name]), name
-    assert not torch.equal(of_checkpoint["scaling"], capture[4])
-    save_checkpoint(tmp_path / "chkpnt7.pth", with_extra_state(capture, {"filter_3d": torch.rand(4, 1)}), 7)
-    with pytest.raises(UserError, match="the 3D filter of the checkpoint does not fit"):
-        read_model(tmp_path / "chkpnt7.pth")
+def test_a_checkpoint_of_a_part_that_is_gone_is_not_shown_without_it(colmap_scene, tmp_path):
+    """The filter of --filter_3d is in the PLY alone. Nor is such a checkpoint trained further."""
+    save_checkpoint(tmp_path / "chkpnt7.pth", with_extra_state(model(5).capture(), {"filter_3d": torch.rand(5, 1)}), 7)
+    for read in (read_model, lambda path: train_on(colmap_scene, tmp_path / "out", *WORDS, "--start_checkpoint", path)):
+        with pytest.raises(UserError, match=r"has a state of filter_3d, which this code .* from its PLY by --init_ply"):
+            read(tmp_path / "chkpnt7.pth")
 
 
 @pytest.mark.parametrize("options", [("--train_test_exp",), ("--appearance", "ppisp"), ("--refine_poses",)])

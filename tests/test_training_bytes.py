@@ -46,7 +46,7 @@ COVERING = (
     "together",
     "appearance",
     "sparse",
-    "filter and budget",
+    "budget",
     "points and poses",
     "asleep, together",
     "asleep, budget",
@@ -165,7 +165,7 @@ def test_pairs_of_parts_resumed(scene, tmp_path):
     # tests/parts has the first; the second keeps nothing, and test_resumed has the last.
     assert begin - {"more_photos", "remote_viewer", "sleep"} <= PART_OPTIONS.keys()
     pairs = {frozenset(pair) for pair in combinations(PART_OPTIONS, 2) if _goes_together(*pair)}
-    assert len(pairs) > 55
+    assert len(pairs) > 44
     for names in _covering(pairs):
         out = tmp_path / "+".join(names)
         words = [word for name in names for word in PART_OPTIONS[name]]
@@ -219,7 +219,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 @pytest.mark.parametrize("size", [2, 3])
 def test_ranks(scene, tmp_path, once, plain, size):
     """With all that a kind may have of its own: terms, optimisers, strategies, cameras, and images of one tile."""
-    names = "sparse", "appearance", "tiny", "together", "mcmc", "filter and budget", "poses"
+    names = "sparse", "appearance", "tiny", "together", "mcmc", "budget", "poses"
     kinds = [(name, ()) for name in (*names, "asleep, together", "asleep, budget")]
     kinds.append(("exposure", ("--plain_step",)))
     start = plain_training(once, "asleep, default") / "chkpnt33.pth"

@@ -16,8 +16,8 @@ import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from scene.sleeping import Sleeping
-from splatting.parts import filter_3d, sky_shell
 from splatting.parts import robust_mask_residuals as residuals
+from splatting.parts import sky_shell
 from splatting.training import loop, run
 from splatting.training.iteration import Iteration
 from splatting.training.steps import FasterSteps
@@ -48,8 +48,6 @@ OPTIONS = {
     "mcmc": MCMC,
     "mcmc idle": ("--strategy", "mcmc", "--mcmc_growth", 0, "--mcmc_min_opacity", 1e-6),
     "mcmc sparse": (*MCMC, "--optimizer_type", "sparse_adam", "--antialiasing"),
-    "filter and adc": ("--filter_3d", "--antialiasing"),
-    "filter and budget": ("--filter_3d", "--antialiasing", *BUDGET),
     "budget": BUDGET,
     "sky": ("--sky", "auto", "--densify_grad_threshold", 1e-5),
     "robust mask": ("--robust_mask", 0.3, "--opacity_reset_interval", 3000),
@@ -74,7 +72,6 @@ PART_OPTIONS = {  # that begin with something of a checkpoint, or of the scene
     "sky": ("--sky", "auto"),
     "sparse_depth": ("--sparse_depth", 0.5),
     "ppisp": ("--appearance", "ppisp"),
-    "filter_3d": ("--filter_3d",),
 }
 
 
@@ -122,7 +119,6 @@ def trained(scene: Path, out: Path, *options: object) -> dict[str, bytes | list]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
         patch.setattr(run, "SH_INTERVAL", 12)  # between the iterations that change rows
-        patch.setattr(filter_3d, "INTERVAL", 15)
         patch.setattr(residuals.Residuals, "early", 0)  # renders are far from the photos
         patch.setattr(residuals, "_FACTOR", 1.2)
         patch.setattr(residuals, "_BESIDE", 0.4)

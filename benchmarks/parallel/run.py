@@ -8,7 +8,7 @@ import train
 from benchmarks.parallel.workload import Workload
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
-from scene.sampling_rate import share_in_view
+from scene.in_view import share_in_view
 from scene.sleeping import Sleeping
 from splatting.distributed.ranks import ranks
 from splatting.evaluation.training_log import Stopwatch

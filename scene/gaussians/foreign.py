@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from scene.gaussians.attributes import Rows
-from scene.gaussians.filtered import filtered
+from splatting.deterministic.portable_math import exp, log
 from splatting.files.ply_header import header_lines
 from splatting.files.unread import say_once, say_unread
 
@@ -33,7 +33,7 @@ def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, us
             "--antialiasing"
         )
         widths = torch.from_numpy(np.asarray(vertices[_FILTER], np.float32).reshape(-1, 1).copy())
-        opacity, scaling = filtered(rows["opacity"], rows["scaling"], widths)
+        opacity, scaling = _filtered(rows["opacity"], rows["scaling"], widths)
         rows = rows | {"opacity": opacity, "scaling": scaling}
     say_unread(path, "ply", names)
     elements = {words[1] for line in header_lines(path) if len(words := line.split()) == 3 and words[0] == "element"}
@@ -41,6 +41,20 @@ def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, us
     if any(name.startswith(_MOVING) for name in names) or any(name.startswith("delta_") for name in elements):
         say_once(f"warning: {path} is a model that moves, of which only one state is drawn; some of it may look wrong")
     return rows
+
+
+def _filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
+    """Logits (N, 1) and log scales (N, 3) behind the filter of `widths` (N, 1) of Mip-Splatting (Yu et al. 2024).
+
+    Variances grow by that of the filter, and the opacity falls with the square root of the covariance's determinant.
+    """
+    x, s, width = logits.double(), log_scales.double(), widths.double()
+    wider = 0.5 * log(1 + width * width * exp(-2 * s))
+    fainter = wider[:, :1] + wider[:, 1:2] + wider[:, 2:]  # -ln of sqrt(determinant before / after)
+    # The new 1 / opacity - 1 is `rest` over exp(-fainter), and for x < 0 over e, too: no term overflows.
+    e, positive = exp(-x.abs()), x > 0
+    rest = torch.where(positive, e, 1.0) + torch.where(positive, 1.0, e) * (1 - exp(-fainter))
+    return (x.clamp_max(0) - fainter - log(rest)).to(logits.dtype), (s + wider).to(log_scales.dtype)
 
 
 def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:

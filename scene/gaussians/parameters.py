@@ -55,8 +55,7 @@ class GaussianParameters:
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
     present view, or None; density control keeps it in step with the rows. columns: further values
-    (N, ...) by name that move with the rows, zero in new ones. drawn: from raw opacities and scales to those that are
-    drawn or written as a PLY, and by `chain` the derivatives (scene/fused_adam.py); None: the same.
+    (N, ...) by name that move with the rows, zero in new ones.
     """
 
     # What a subclass need not set whose __init__ sets the reference's attributes and does not call this one.
@@ -70,7 +69,6 @@ class GaussianParameters:
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
     columns: dict[str, Tensor] = MappingProxyType({})
-    drawn: Callable[[Tensor, Tensor], tuple[Tensor, Tensor]] | None = None
 
     _xyz: Tensor
     _features_dc: Tensor
@@ -164,7 +162,7 @@ class GaussianParameters:
     @property
     def get_scaling(self) -> Tensor:
         """Standard deviations (N, 3) along the Gaussian's own axes, world units."""
-        return self.scaling_activation(self._drawn_shapes()[1])
+        return self.scaling_activation(self._scaling)
 
     @property
     def get_rotation(self) -> Tensor:
@@ -174,23 +172,17 @@ class GaussianParameters:
     @property
     def get_opacity(self) -> Tensor:
         """Opacities (N, 1) in (0, 1)."""
-        return self.opacity_activation(self._drawn_shapes()[0])
+        return self.opacity_activation(self._opacity)
 
     def get_covariance(self, scaling_modifier: float = 1.0) -> Tensor:
         """World covariances R S S R^T, S = modifier * scales: (N, 6), order xx xy xz yy yz zz."""
         return self.covariance_activation(self.get_scaling, scaling_modifier, self._rotation)
 
-    def _drawn_shapes(self) -> tuple[Tensor, Tensor]:
-        """Raw opacities and scales as they are drawn."""
-        raw = self._opacity, self._scaling
-        return raw if self.drawn is None else self.drawn(*raw)
-
     def raw_geometry(self) -> dict[str, Tensor]:
         """Raw shapes by the rasterizer's names: opacities (N, 1) logit, scales (N, 3) log, rotations (N, 4) wxyz."""
         if self._scaling.shape[1] == 2:
             raise UserError(f"this model has {FLAT}")
-        opacities, scales = self._drawn_shapes()
-        return {"opacities": opacities, "scales": scales, "rotations": self._rotation}
+        return {"opacities": self._opacity, "scales": self._scaling, "rotations": self._rotation}
 
     @property
     def kernels_activate(self) -> bool:
@@ -277,14 +269,9 @@ class GaussianParameters:
         return {"world_offset": self.world_offset, "enlargement": self.enlargement}
 
     def save_ply(self, path: str | os.PathLike) -> None:
-        """Write the raw parameters, as they are drawn, as a PLY in the reference's layout."""
+        """Write the raw parameters as a PLY in the reference's layout."""
         comments = frame_comments(self.world_offset, self.enlargement)
-        write_ply(path, self.drawn_rows(), self._degree_of_tensors(), comments, shards=self.shards)
-
-    def drawn_rows(self) -> Rows:
-        """Raw values by optimiser group, as they are drawn."""
-        opacity, scaling = (values.detach() for values in self._drawn_shapes())
-        return raw_rows(self) | {"opacity": opacity, "scaling": scaling}
+        write_ply(path, raw_rows(self), self._degree_of_tensors(), comments, shards=self.shards)
 
     @property
     def size_as_ply(self) -> int:
@@ -292,11 +279,8 @@ class GaussianParameters:
         return self.gaussian_count * row_bytes(self.max_sh_degree)
 
     def part(self, keep: Tensor | slice, sh_degree: int) -> "GaussianParameters":
-        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser.
-
-        It looks the same.
-        """
-        rows = self.drawn_rows()
+        """A copy of the Gaussians `keep`, (N,) bool or a slice, with the SH bands up to sh_degree; no optimiser."""
+        rows = raw_rows(self)
         rest = rows.pop("f_rest")[:, : (sh_degree + 1) ** 2 - 1]
         rows = {name: values[keep] for name, values in rows.items()}
         rows["f_rest"] = to_host(rest, keep) if is_spilled(rest) else rest[keep].contiguous()
@@ -326,7 +310,7 @@ class GaussianParameters:
             room = empty_for(self, name, like, len(rows[name]))
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
-        self.columns, self.drawn = {}, None
+        self.columns = {}
         self.shards = self.shards.of(len(self))
         self._zero_statistics()
 

@@ -36,11 +36,11 @@ class Sleep(Part):
         from scene import sleeping
         from scene.fused_adam import FusedAdam
         from scene.gaussians.adam import GaussianAdam
-        from scene.sampling_rate import share_of
+        from scene.in_view import share_of
 
         run, strategy = self._run, self._run.strategy
         dense = type(run.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(run.gaussians)
-        alone = not (strategy.queues or any(strategy.penalty) or run.gaussians.drawn is not None)
+        alone = not (strategy.queues or any(strategy.penalty))
         if not (dense and alone and run.is_standard):
             return False
         return run.group.anyone(run.gaussians.room.limit > 0) or share_of(run.scene, run.device) < sleeping.MOST_SHARE

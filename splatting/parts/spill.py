@@ -80,7 +80,7 @@ def announce(run: Any, memory: "GpuMemory") -> None:
     """
     from scene import sleeping
     from scene.gaussians.adam import GaussianAdam
-    from scene.sampling_rate import share_of
+    from scene.in_view import share_of
     from splatting.findings.resources import expected_count
 
     now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size

@@ -36,7 +36,7 @@ class Iteration:
     last: bool  # nothing comes after it, so it takes no step
     camera: Camera
     background: Tensor  # (3,), random or that of the scene
-    changes: bool  # rows of the Gaussians, the SH degree, the size of views or the 3D filter change in this iteration
+    changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
     rests: bool = False  # an earlier run ended with it, and took no step

@@ -10,14 +10,13 @@ CSRC = "submodules/diff-gaussian-rasterization/csrc"
 
 
 class Fault(NamedTuple):
-    """old, which the file has exactly once, becomes new. options: of a training that the fault can harm."""
+    """old, which the file has exactly once, becomes new."""
 
     name: str
     origin: str
     file: str
     old: str
     new: str
-    options: tuple[str, ...] = ()
 
     @property
     def on_gpu(self) -> bool:
@@ -76,15 +75,6 @@ FAULTS = (
         f"{CSRC}/cpu/bin_isa.cpp",
         "  list_tiles(splat, rect, image, in.table, mask, tiles);\n",
         "  splat.log2_opacity -= T(1e-4);\n  list_tiles(splat, rect, image, in.table, mask, tiles);\n",
-    ),
-    Fault(
-        "3D filter's opacity factor overflows",
-        "brush#522",
-        "scene/gaussians/filtered.py",
-        "fainter = wider[:, :1] + wider[:, 1:2] + wider[:, 2:]",
-        "before, after = (exp(2 * t).prod(1, keepdim=True).float() for t in (s, s + wider))\n"
-        "        fainter = 0.5 * log((after / before).double())",
-        ("--filter_3d",),
     ),
     Fault(
         "clamp without its derivative",

@@ -77,8 +77,6 @@ template <class T>
 void describe_vjp(const Executor&, const DescribedInput<T>&, const DescribedGradient<T>&);
 template <class T>
 void pinhole(const Executor&, const T* pose, const T* intrinsics, Image, const PinholeMatrices<T>&);
-template <class T>
-void chain_rows(int64_t count, const T* factors, T* logits, T* log_scales);
 
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known. camera_vjp: what each block of kSleepBlock

@@ -420,8 +420,8 @@ struct StepNow {
 };
 
 // The step that every Gaussian takes as soon as its gradients are known, so that these never reach memory. The values
-// are those of the Scene, unless there is a chain, and change in place: a Gaussian's row is read before it is written,
-// and no other reads it. Blocks that sleep (Scene::awake) take no step.
+// are those of the Scene, and change in place: a Gaussian's row is read before it is written, and no other reads it.
+// Blocks that sleep (Scene::awake) take no step.
 template <class T>
 struct GaussianStep {
   AdamInput<T> attributes[kStepped];  // the gradients are not read; without columns an attribute takes no step
@@ -431,7 +431,6 @@ struct GaussianStep {
   ObserveInput observed;  // the view's gradients are not read; with max_radii null nothing is observed
   Penalty<T> penalty;     // whose gradients are added, where opacities and scales take steps
   double* camera;         // the gradients of the camera's numbers (math/camera_gradient.h), before the step; or null
-  const T* chain;  // (N, kChain) of math/chain.h: opacities and scales of the Scene are functions of values; or null
 };
 
 // The blocks of Gaussians that sleep (math/sleep.h) through a step. Blocks that wake take the steps before it that they

@@ -5,7 +5,6 @@
 
 #include "../backend.h"
 #include "../math/camera_gradient.h"
-#include "../math/chain.h"
 #include "project_vjp_rows.h"
 #include "step_rows.h"
 
@@ -116,7 +115,6 @@ void project_vjp_step(const Executor& executor, const Scene<T>& s, const int32_t
       if (!step.attributes[kStepShRest].columns) wanted.sh_rest = nullptr;
       vjp_rows(part_of(s, begin, count), camera, tile_counts + begin, from_moments(s, moments, begin), wanted);
       observe_block(step.observed, begin, count, gradient);
-      if (step.chain) chain_rows(count, step.chain + kChain * begin, gradient.opacities, gradient.scales);
       penalise_block(step, begin, count, gradient);
       if (may && !step_block(step, steps, begin, count, gradient)) __atomic_store_n(&finite, false, __ATOMIC_RELAXED);
     });

@@ -4,7 +4,6 @@
 #include <cuda_runtime.h>
 
 #include "../backend.h"
-#include "../math/chain.h"
 #include "../math/observe.h"
 #include "../math/step_now.h"
 #include "guarded_adam.cuh"
@@ -35,11 +34,6 @@ struct StepParameters {
 // Of a step with a penalty. It is a type of its own, so that other steps have no code for it.
 struct PenalisedStep : StepParameters {
   Penalty<float> penalty;
-};
-
-// Of a step whose opacities and scales are functions of the parameters, with a penalty or without.
-struct ChainedStep : PenalisedStep {
-  const float* chain;
 };
 
 inline StepParameters step_parameters(const GaussianStep<float>& in) {
@@ -149,23 +143,13 @@ __device__ inline void observe_one(const ObserveInput& in, int64_t i, int64_t at
   in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
 }
 
-// No caller inlines it, so that the rest of the kernel stays as it is.
-__device__ __noinline__ inline void chain_one(const float* factors, float* logit, float* log_scales) {
-  chain_rule(factors, logit, log_scales);
-}
-
-// Makes the gradients of the lane's Gaussian `i` those of its parameters, with a penalty.
+// Adds the gradients of a penalty to those of the lane's Gaussian `i`.
 __device__ __forceinline__ void finish_one(const StepParameters&, int64_t, const WarpGradients&) {}
 __device__ inline void finish_one(const PenalisedStep& in, int64_t i, const WarpGradients& g) {
   const int lane = threadIdx.x & 31;
   const SteppedRows &logits = in.rows[kStepOpacities], &log_scales = in.rows[kStepScales];
   if (logits.columns) penalise_opacity(in.penalty, logits.value + i, g.opacities() + lane);
   if (log_scales.columns) penalise_scales(in.penalty, log_scales.value + 3 * i, g.scales() + 3 * lane);
-}
-__device__ inline void finish_one(const ChainedStep& in, int64_t i, const WarpGradients& g) {
-  const int lane = threadIdx.x & 31;
-  chain_one(in.chain + kChain * i, g.opacities() + lane, g.scales() + 3 * lane);
-  if (in.penalty.opacity != 0 || in.penalty.scale != 0) finish_one(static_cast<const PenalisedStep&>(in), i, g);
 }
 
 // Takes the step of a warp's Gaussians; all of its lanes call it. `first` is the warp's first Gaussian, `rest` has

@@ -86,9 +86,9 @@ struct RowBefore {
 struct Addition : StepParameters {};
 
 // Computes gradients, and either writes them or takes the Gaussians' steps. It is one kernel for both, because a
-// compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters,
-// PenalisedStep or ChainedStep, between which nothing differs but a call; or Addition, whose code would cost these
-// registers, and whose sums may therefore differ by rounding.
+// compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters or
+// PenalisedStep, between which nothing differs but a call; or Addition, whose code would cost these registers, and
+// whose sums may therefore differ by rounding.
 template <class AnyCamera, class Source, class Step>
 __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kBlocks - 1 : kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
@@ -180,9 +180,7 @@ void launch_step(const Queue& queue, const Scene<float>& s, const SlotSums<kRays
   if constexpr (kRays == kNoRays)
     if (step.camera) camera_vjp(queue, s, source, step.camera);
   const StepParameters parameters = step_parameters(step);
-  if (step.chain)
-    launch_project_vjp<kRays>(queue, s, source, {}, ChainedStep{{parameters, step.penalty}, step.chain});
-  else if (step.penalty.any())
+  if (step.penalty.any())
     launch_project_vjp<kRays>(queue, s, source, {}, PenalisedStep{parameters, step.penalty});
   else
     launch_project_vjp<kRays>(queue, s, source, {}, parameters);

@@ -4,7 +4,6 @@
 #include <vector>
 
 #include "backend_run.h"
-#include "math/chain.h"
 
 struct StepCase {
   bool sparse = false, guarded = false, observed = true;
@@ -12,7 +11,6 @@ struct StepCase {
   bool opacities_step = true;
   float gradient = 1;  // dLoss/dcolor of a pixel in the middle; of the others 1
   gs::Penalty<float> penalty = {0, 0};
-  bool chained = false;
 };
 
 // Everything that a step changes.
@@ -20,7 +18,6 @@ struct Stepping {
   Parameters<float> values;
   std::vector<float> mean[6], square[6];
   std::vector<float> statistics;  // max_radii, gradient_sums, views
-  std::vector<float> chain;
   int64_t stopped = 0;
   float loss = 0.5f;
 
@@ -30,7 +27,6 @@ struct Stepping {
         mean[a].push_back(float(0.1 * normal())), square[a].push_back(float(std::abs(normal()) + 1e-3));
     }
     for (int64_t k = 0; k < 3 * p.count; ++k) statistics.push_back(float(std::abs(normal())));
-    for (int64_t k = 0; k < gs::kChain * p.count; ++k) chain.push_back(float(normal()));
   }
 
   // Adam's inputs in the order of gs::Stepped; `gradients` may be null.
@@ -94,8 +90,6 @@ void step_plainly(const Where& where, Stepping& s, const StepCase& how, const Re
   const gs::SceneGradient<float>& g = gradient.pointers;
   fill(g);
   if (how.observed) observe(where, s.observe(how, r.radii.data(), g.means2d));
-  for (int64_t i = 0; how.chained && i < s.values.count; ++i)
-    gs::chain_rule(s.chain.data() + gs::kChain * i, g.opacities + i, g.scales + 3 * i);
   if (how.penalty.any())
     penalise(where, gs::PenaltyInput<float>{s.values.count, how.penalty, s.values.opacities.data(),
                                             s.values.scales.data(), g.opacities, g.scales});
@@ -118,7 +112,6 @@ inline gs::GaussianStep<float> gaussian_step(Stepping& s, const StepCase& how, c
   step.sparse = how.sparse;
   step.observed = s.observe(how, r.radii.data(), nullptr);
   step.penalty = how.penalty;
-  if (how.chained) step.chain = s.chain.data();
   return step;
 }
 
@@ -136,6 +129,4 @@ inline const StepCase kStepCases[] = {
     {false, true, true, 45, true, 1, {0.3f, 0.2f}},
     {true, false, true, 45, true, 1, {0.3f, 0}},
     {false, false, false, 9, false, 1, {0.3f, 0.2f}},
-    {false, true, true, 45, true, 1, {0, 0}, true},
-    {true, false, true, 9, true, 1, {0.3f, 0.2f}, true},
 };

@@ -4,7 +4,6 @@
 
 #include "backward.h"
 #include "math/camera_gradient.h"
-#include "math/chain.h"
 #include "math/step_now.h"
 #include "optim.h"
 
@@ -12,7 +11,7 @@ namespace gs::ops {
 
 namespace {
 
-constexpr size_t kGaussians = kInputs - 1, kWithChain = kGaussians + 3;  // tensors of the Gaussians
+constexpr size_t kGaussians = kInputs - 1;  // tensors of the Gaussians
 
 // Checks the attributes that step, their counters, and the lengths of the lists with an entry for each.
 void check_steps(Sizes attributes, List<Tensor> steps, std::initializer_list<size_t> lengths) {
@@ -101,23 +100,6 @@ struct Step {
     GS_CHECK(scene.dtype() == ScalarType::Float, "now is of float32 Gaussians, got float64");
   }
 
-  // The tensor that steps for one of the Gaussians' tensors.
-  static const Tensor& parameter(List<Tensor> gaussians, int place) {
-    const bool chained = gaussians.size() == kWithChain && (place == 1 || place == 2);
-    return gaussians[chained ? kGaussians - 1 + place : place];
-  }
-
-  void check_chain(const SceneTensors& scene, List<Tensor> gaussians) const {
-    if (gaussians.size() != kWithChain) return;
-    GS_CHECK_VALUE(scene.raw() && !scene.flat_opacities(),
-                   "parameters are of raw Gaussians, whose opacities are (N, 1)");
-    check_tensor(gaussians[kGaussians], "the opacities' parameters", scene.dtype(), scene.device(), {scene.count(), 1});
-    check_tensor(gaussians[kGaussians + 1], "the scales' parameters", scene.dtype(), scene.device(),
-                 {scene.count(), 3});
-    check_tensor(gaussians[kWithChain - 1], "chain", scene.dtype(), scene.device(), {scene.count(), gs::kChain});
-    GS_CHECK_VALUE(gaussians[kWithChain - 1].is_contiguous(), "chain must be contiguous");
-  }
-
   // What a backend takes. pixels: the radii, contiguous; those of `blocks`, if that is defined.
   template <class T>
   gs::GaussianStep<T> of(List<Tensor> gaussians, const Tensor& pixels, const Tensor& blocks = {}) const {
@@ -125,7 +107,7 @@ struct Step {
     gs::GaussianStep<T> out{};
     out.sparse = sparse;
     for (size_t k = 0; k < attributes.size(); ++k) {
-      const Tensor& value = parameter(gaussians, kPlaces[attributes[k]]);
+      const Tensor& value = gaussians[kPlaces[attributes[k]]];
       const Tensor &mean = averages[k], &square = averages[attributes.size() + k];
       check_moments(value, value, mean, square);
       gs::AdamInput<T> in = adam_input<T>(value, value, mean, square, columns[k]);
@@ -137,7 +119,6 @@ struct Step {
     if (now) out.now = reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
     out.penalty = {T(constants[3]), T(constants[4])};
     if (const MaybeTensor gradient = camera()) out.camera = write<double>(*gradient);
-    if (gaussians.size() == kWithChain) out.chain = read<T>(gaussians[kWithChain - 1]);
     if (!pixels.defined()) return out;
     out.observed = {pixels.numel(), nullptr, nullptr, nullptr, read<int32_t>(pixels), nullptr};
     if (!observes()) return out;
@@ -148,12 +129,10 @@ struct Step {
   }
 };
 
-// gaussians: those of Input, in its order, without means2d; an empty tensor of one axis stands for none. In a step may
-// follow the parameters of opacities and scales, which step in their place, and the chain (math/chain.h). camera: view
+// gaussians: those of Input, in its order, without means2d; an empty tensor of one axis stands for none. camera: view
 // matrix, projection and centre, then which blocks are awake (SceneTensors::set_awake), unless all are.
 SceneTensors scene_of(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options) {
-  const bool known = gaussians.size() == kGaussians || gaussians.size() == kWithChain;
-  GS_CHECK_VALUE(known && (camera.size() == 3 || camera.size() == 4), "give ", kGaussians,
+  GS_CHECK_VALUE(gaussians.size() == kGaussians && (camera.size() == 3 || camera.size() == 4), "give ", kGaussians,
                  " tensors of the Gaussians and 3 or 4 of the camera, got ", gaussians.size(), " and ", camera.size());
   std::array<const Tensor*, kGaussians> inputs;
   for (size_t input = 0; input < inputs.size(); ++input) {
@@ -212,7 +191,6 @@ void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double
   }
   const Step step{STEP_ARGUMENTS};
   step.check(scene);
-  step.check_chain(scene, gaussians);
   const Tensor pixels = packed(*radii), lengths = absolute_like(scene, absolute && step.observes());
   const GradientSource from(scene, SOURCE_ARGUMENTS, absolute, lengths.defined());
   with_scalar(scene.dtype(), [&](auto zero) {

@@ -1,4 +1,4 @@
-"""At which rate a view samples points, and how many of them it sees."""
+"""The points that a view sees, and their share."""
 
 import math
 from collections.abc import Sequence
@@ -12,24 +12,17 @@ from scene.scene import Scene
 from scene.view import View
 
 
-def sampling_rate(points: Tensor, view: Any, enlargement: float = 1.0) -> Tensor:
-    """Pixels of a view by unit of length at points (N, 3); (N,), 0 at points that it does not show.
-
-    enlargement: of the model where it is drawn. A lens counts by its focal length on the axis; in a fisheye or a
-    panorama, pixels are proportional to angles.
-    """
+def is_in_view(points: Tensor, view: Any, enlargement: float = 1.0) -> Tensor:
+    """Tell which points (N, 3) a view shows, (N,) bool. enlargement: of the model where it is drawn."""
     lens = getattr(view, "lens", None)
     if lens and lens.chart != "perspective":
         x, y, z, _ = _transformed(points, view.world_view_transform)
         depth = (x * x + y * y + z * z).sqrt()
-        field = min(lens.field(view.image_width, view.image_height), math.pi)
-        inside, focal = z >= math.cos(field) * depth, max(lens.focal)
+        inside = z >= math.cos(min(lens.field(view.image_width, view.image_height), math.pi)) * depth
     else:
         x, y, _, depth = _transformed(points, view.full_proj_transform)
         inside = (x.abs() < depth) & (y.abs() < depth)
-        sides = (view.image_width, view.FoVx), (view.image_height, view.FoVy)
-        focal = max(side / (2 * math.tan(angle / 2)) for side, angle in sides)
-    return torch.where(inside & (depth > NEAREST / enlargement), focal / depth, 0.0)
+    return inside & (depth > NEAREST / enlargement)
 
 
 def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
@@ -41,7 +34,7 @@ def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
 def share_in_view(points: Tensor, cameras: Sequence[View], enlargement: float = 1.0) -> float:
     """The share of points (N, 3) that a camera sees, on the mean of up to 32 cameras. Distortion is left out."""
     views = cameras[:: -(-len(cameras) // 32)]
-    return sum(float((sampling_rate(points, view, enlargement) > 0).float().mean()) for view in views) / len(views)
+    return sum(float(is_in_view(points, view, enlargement).float().mean()) for view in views) / len(views)
 
 
 def share_of(scene: Scene, device: torch.device) -> float:
