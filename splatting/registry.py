@@ -14,7 +14,6 @@ if TYPE_CHECKING:
 
 # Names of modules, with the reason for the place, where there is one.
 PARTS = (
-    "more_photos",  # refuses a scene before anything trains on it
     "time_budget",
     "exposure",  # adds training views before anything moves them
     "refine_poses",  # its cameras stand right before anything asks where they are
@@ -70,10 +69,11 @@ def options_of(group: str) -> "list[Option]":
 
 
 EXPOSURES = "exposures"  # the model's own key of what an appearance has trained
-# Of states in checkpoints before 0.3.
+# Of states in checkpoints of 0.3 and before.
 _OLD_KEYS = {
     "asleep": "sleep",
     "best": "keep_best",  # which is gone, and refused by this name
+    "more_photos": "resume",
     "poses": "refine_poses",
     "residuals": "robust_mask",
     "schedule": "time_budget",

@@ -162,8 +162,8 @@ def _covering(pairs: set[frozenset[str]]) -> Iterator[list[str]]:
 
 def test_pairs_of_parts_resumed(scene, tmp_path):
     begin = {name for name in PARTS if {"begin", "state"} & {*vars(part_class(name))}}
-    # tests/parts has the first; the second keeps nothing, and test_resumed has the last.
-    assert begin - {"more_photos", "remote_viewer", "sleep"} <= PART_OPTIONS.keys()
+    # test_more_photos.py has the first; the second keeps nothing, and test_resumed has the last.
+    assert begin - {"resume", "remote_viewer", "sleep"} <= PART_OPTIONS.keys()
     pairs = {frozenset(pair) for pair in combinations(PART_OPTIONS, 2) if _goes_together(*pair)}
     assert len(pairs) > 44
     for names in _covering(pairs):

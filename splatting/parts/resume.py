@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from splatting.files.json_files import MODEL_JSON, read_model_json
 from splatting.option import MOST_NEEDED, Option
-from splatting.part import Error, Options, Part
+from splatting.part import Error, Options, Part, fill
 from splatting.registry import PARTS, part_class
 from splatting.training.schedule import STEADY
 from utils.system_utils import UserError
@@ -34,7 +34,11 @@ _SPEED = 2e8  # bytes that a disk writes in a second, until it has shown how man
 
 
 class Resume(Part):
-    """With --resume, writes a checkpoint from time to time. Leaves one at the end, and notes that it was reached."""
+    """With --resume, writes a checkpoint from time to time. Leaves one at the end, and notes that it was reached.
+
+    Where a checkpoint is resumed with more photos, every second iteration trains on one of them at first. Checkpoints
+    from then on keep which these were, so that a resumed training has the same order of views.
+    """
 
     name = "resume"
     told_last = True  # after the checkpoints that were asked for
@@ -51,6 +55,20 @@ class Resume(Part):
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:
         return True
+
+    def begin(self, run: Any, state: Any) -> None:
+        from splatting.parts.resume_photos import new_photos, restored
+
+        if added := new_photos(run):
+            count, until = len(added["names"]), added["until"]
+            print(f"{count} photos are new; until iteration {until} every second one trains on one of them")
+            fill(run, "has_new_photos", True, self)
+        self._added = added or state
+        if self._added is not None:
+            fill(run, "views", restored(run.views, self._added), self)
+
+    def state(self) -> Any:
+        return self._added
 
     def ready(self, run: Any) -> None:
         """Say what this training does to that of its folder, once nothing can refuse it."""

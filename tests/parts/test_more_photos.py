@@ -3,23 +3,19 @@
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from synthetic import make_colmap_scene
-from trainings import train_on
+from trainings import before_steps, train_on
 
-from splatting.parts.more_photos_order import Added, added_order
+from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
+from splatting.parts.resume_photos import NewFirst, _until, restored
 from splatting.training.iteration import ViewOrder
-from splatting.training.run import Run
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1, "--densify_until_iter", 0)
 FIRST = 40
-
-
-class _View:
-    def __init__(self, name: str) -> None:
-        self.image_name = name
 
 
 @pytest.fixture(autouse=True)
@@ -66,31 +62,18 @@ def first(scenes, tmp_path_factory) -> Path:
     return out / f"chkpnt{FIRST}.pth"
 
 
-def _seen(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Names of the views that a training takes, as they come."""
-    names, iterations = [], Run.iterations
-
-    def noted(self: Run):
-        for step in iterations(self):
-            names.append(step.camera.image_name)
-            yield step
-
-    monkeypatch.setattr(Run, "iterations", noted)
-    return names
-
-
 def test_new_photos_train_more_often_at_first(scenes, first, tmp_path, monkeypatch, capfd):
     whole, _, new = scenes
-    names, out = _seen(monkeypatch), tmp_path / "out"
-    train_on(whole, out, *WORDS, "--start_checkpoint", first, "--iterations", 80)
+    names = []
+    before_steps(monkeypatch, lambda step: names.append(step.camera.image_name))
+    train_on(whole, tmp_path / "out", *WORDS, "--start_checkpoint", first, "--iterations", 80)
     # Trained 40 / 15 times each: the two new ones catch up within 10 iterations.
     said = capfd.readouterr()
     assert "2 photos are new; until iteration 50 every second one trains on one of them" in said.out
     assert f"was trained with --source_path {scenes[1]}, this run has --source_path {whole}" in said.err
     assert names[:10:2] == [name for name in names[:10] if name in new] and {*names[:4:2]} == {*new}
     assert len({*names[10:27]}) > 13 and len(names) == 40
-    old = [name for name in _names(whole) if name not in new]
-    assert {*names[1:10:2]} <= {*old}
+    assert not {*names[1:10:2]} & {*new}
 
 
 @pytest.mark.parametrize(
@@ -103,7 +86,7 @@ def test_new_photos_train_more_often_at_first(scenes, first, tmp_path, monkeypat
     ],
 )
 def test_options_that_keep_something_of_each_photo(scenes, tmp_path, more, said, capfd):
-    """And what may be added trains to the same bytes after a stop."""
+    """And what may be added trains to the same bytes after a stop, also from a checkpoint of 0.3."""
     train_on(scenes[1], tmp_path / "a", *WORDS, "--iterations", 20, *more)
     words = *WORDS, "--iterations", 50, *more, "--checkpoint_iterations", 30, "--start_checkpoint"
     if "cannot" in said or "leave" in said:
@@ -113,6 +96,11 @@ def test_options_that_keep_something_of_each_photo(scenes, tmp_path, more, said,
     whole = train_on(scenes[0], tmp_path / "b", *words, tmp_path / "a/chkpnt20.pth")
     assert said in capfd.readouterr().out
     assert train_on(scenes[0], tmp_path / "c", *words, tmp_path / "b/chkpnt30.pth") == whole
+    capture, iteration = load_checkpoint(tmp_path / "b/chkpnt30.pth")
+    old = {"since": 20, "until": 25, "names": scenes[2]}
+    assert capture[10].pop("resume") == old
+    save_checkpoint(tmp_path / "b/chkpnt30.pth", with_extra_state(capture, {"more_photos": old}), iteration)
+    assert train_on(scenes[0], tmp_path / "d", *words, tmp_path / "b/chkpnt30.pth") == whole
 
 
 def test_what_cannot_be_continued_is_refused(scenes, first, tmp_path):
@@ -137,15 +125,16 @@ def test_what_cannot_be_continued_is_refused(scenes, first, tmp_path):
 
 
 def test_the_order_takes_all_views():
-    views = [_View(str(number)) for number in range(7)]
+    views = [SimpleNamespace(image_name=str(number)) for number in range(7)]
     every = ViewOrder(views, 0)
-    order = added_order(every, Added.at(100, 1000, ["5", "6"], views))
-    assert Added.at(100, 1000, ["5", "6"], views).until == 180 and Added.at(100, 120, ["5"], views).until == 110
+    order = NewFirst(every, 100, 180, ["5", "6"])
     names = [order[t].image_name for t in range(101, 181)]
     assert {names[t] for t in range(0, 80, 2)} == {"5", "6"} and {*names[1::2]} == {*"01234"}
     assert all(order[t] is every[t] for t in (99, 100, 181, 500))
-    assert len({*order.coming(101, 7)}) == len(order.coming(101, 7)) == 5
-    assert added_order(every, Added(1, 9, ["x"])) is every
+    assert [NewFirst(every, 1, 9, ["x"])[t] for t in range(1, 20)] == [every[t] for t in range(1, 20)]
+    for names, last, until in ((["5", "6"], 1000, 180), (["5"], 120, 110), (["5"], None, 133)):
+        run = SimpleNamespace(first_iteration=100, schedule=SimpleNamespace(ends=last), views=every)
+        assert _until(run, names) == until
 
 
 @pytest.mark.parametrize(
@@ -153,4 +142,4 @@ def test_the_order_takes_all_views():
 )
 def test_damaged_records(state):
     with pytest.raises(UserError, match="record of added photos is damaged"):
-        Added.restored(state)
+        restored(ViewOrder([SimpleNamespace(image_name="a")], 0), state)
