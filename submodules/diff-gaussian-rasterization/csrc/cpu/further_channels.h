@@ -1,6 +1,7 @@
 #pragma once
 // The channels behind the first four, which blending takes as it takes colours (tile_chunk.h). For them it finds once
-// what a splat weighs at a tile's pixels; then they take the weights in groups.
+// what a splat weighs at a tile's pixels; then they take the weights in groups. The forward fuses products by name, or a
+// compiler would fuse some of them: a channel would have other bits by its place.
 #include <vector>
 
 #include "gs/lane_halves.h"
@@ -63,14 +64,15 @@ class FurtherPlanes<T, kChannels> {
     V sums[kCount];
     for (int c = 0; c < kCount; ++c) sums[c] = S::load(to + c * kPixels);
     for (int i = 0; i < count_; ++i)
-      for (int c = 0; c < kCount; ++c) sums[c] += weights_[i] * rows_[i][first + c];
+      for (int c = 0; c < kCount; ++c) sums[c] = S::multiply_add(weights_[i], V{} + rows_[i][first + c], sums[c]);
     store(first, sums, to);
   }
 
   __attribute__((noinline)) void add_reached(int64_t first, int64_t end, T* to) const {
     for (int64_t c = first; c < end; ++c, to += kPixels) {
       V sum = S::load(to);
-      for (int i = 0; i < count_; ++i) sum = weights_[i] > 0 ? sum + weights_[i] * rows_[i][c] : sum;
+      for (int i = 0; i < count_; ++i)
+        sum = weights_[i] > 0 ? S::multiply_add(weights_[i], V{} + rows_[i][c], sum) : sum;
       S::store(to, sum);
     }
   }
@@ -113,7 +115,8 @@ class FurtherSums<T, kChannels> {
 
   // `value` and what these channels add to the loss, at a vector of pixels.
   V value(V value, int at) const {
-    for (int64_t c = kLeading; c < channels_.count; ++c) value += values_[c] * S::load(planes_[c - kLeading] + at);
+    for (int64_t c = kLeading; c < channels_.count; ++c)
+      value = S::multiply_add(V{} + values_[c], S::load(planes_[c - kLeading] + at), value);
     return value;
   }
   V slope(V q, V uncapped) const { return uncapped > end_ ? V{} : q; }
@@ -148,11 +151,11 @@ class FurtherSums<T, kChannels> {
     const auto gradient = [&](int i, int c) { return S::load(planes_[first - kLeading + c] + reached_[i].at); };
     if (finite)
       for (int i = 0; i < count_; ++i)
-        for (int c = 0; c < kGroup; ++c) sums[c] += reached_[i].weight * gradient(i, c);
+        for (int c = 0; c < kGroup; ++c) sums[c] = S::multiply_add(reached_[i].weight, gradient(i, c), sums[c]);
     else
       for (int i = 0; i < count_; ++i)
         for (int c = 0; c < kGroup; ++c)
-          sums[c] += reached_[i].weight * (reached_[i].weight > 0 ? gradient(i, c) : V{});
+          sums[c] = S::multiply_add(reached_[i].weight, reached_[i].weight > 0 ? gradient(i, c) : V{}, sums[c]);
     T group[kGroup];
     LaneSums<T, int(sizeof sums[0])>::store(sums, group);
     std::copy_n(group, std::min<int64_t>(kGroup, kMostChannels - first), to + first);
