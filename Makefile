@@ -58,14 +58,14 @@ demo: demo-plan install output/demo_scene
 	$(BIN)/python train.py -s output/demo_scene -m output/demo --eval --iterations 1500 --test_iterations 1500
 	$(BIN)/python render.py -m output/demo --skip_train
 	$(BIN)/python metrics.py -m output/demo
-	$(BIN)/python -m splatting.demo.report output/demo
+	$(BIN)/python -m applications.demo.report output/demo
 
 demo-plan:
 	@echo 'The demo makes a ray-traced scene, trains 1,500 iterations, renders and scores the test views:'
 	@echo 'one to three minutes on two cores, and one to four more to set up .venv if it is missing.'
 
 output/demo_scene: | install
-	$(BIN)/python -m splatting.demo.make_scene $@
+	$(BIN)/python -m applications.demo.make_scene $@
 
 # More processes than cores, as some wait. test-foreign has the tests that are ignored. What takes long is named.
 PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal \

@@ -1,107 +1,16 @@
-"""Show a trained model on a web page that this process serves.
-
-python view.py -m MODEL [--iteration N] [--port PORT]
-python view.py -s SCENE                                 # cameras, photos and points, before a training
-python view.py FILE                                     # a model of any tool, without a scene
-"""
-
-from __future__ import annotations
+"""Show a trained model on a web page that this process serves."""
 
 if __name__ == "__main__":
-    import splatting.host.early  # noqa: F401  (before the other imports, which take a second)
+    import groundwork.host.early  # noqa: F401  (before the other imports, which take a second)
 
-import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
+import sys
 
-import argparse
-import os
+from groundwork import applications
+from utils.system_utils import run_cli
 
-from torch import Tensor
-
-from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from scene.gaussians.morton import sort_scattered
-from scene.scene import Scene
-from scene.splats.splats import drawable, selected
-from scene.with_splats import model_of
-from splatting.camera_paths.without_scene import WithoutScene, circle, saved_scene, warn_if_moved
-from splatting.exports.cleaning import OPTION as CLEAN_OPTION
-from splatting.exports.cleaning import check_clean, clean_scene
-from splatting.exports.reading import ANY, read_any
-from splatting.viewer.page import Page, serve
-from splatting.viewer.server import PORT, check_port
-from splatting.viewer.untrained import untrained
-from utils.general_utils import safe_state
-from utils.system_utils import UserError, run_cli
-
-
-def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
-    """The model of a file, seen from a circle around it. `pipeline` gets antialiasing if the file says so."""
-    splats = read_any(path)
-    splats = selected(splats, drawable(splats))
-    pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
-    folder, name = os.path.split(os.path.abspath(path))
-    gaussians = model_of(splats)
-    sort_scattered(gaussians)
-    return WithoutScene(gaussians, folder, name, circle(splats.means))
-
-
-def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
-    """The model of a folder with its scene, or where that is gone with the poses that the folder records."""
-    scene = saved_scene(options, args.iteration, args.typed_sh_degree)
-    warn_if_moved(options.model_path, scene.getTrainCameras())
-    return scene
-
-
-def kept(
-    scene: Scene | WithoutScene, args: argparse.Namespace, pipe: argparse.Namespace, options: argparse.Namespace
-) -> Tensor | None:
-    """(N,) bool: what --clean leaves, None without it. UserError where the photos are gone."""
-    if not args.clean:
-        return None
-    if isinstance(scene, WithoutScene):
-        raise UserError(f"--clean needs the photos of {options.source_path}, which is gone; leave it out")
-    return clean_scene(scene, args.clean, pipe, options.white_background)[0].keep
-
-
-def main() -> None:
-    parser = OptionParser(description="Show a trained model on a web page, until Ctrl-C.")
-    model_params = ModelParams(parser, sentinel=True)
-    pipeline_params = PipelineParams(parser, sentinel=True)
-    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to show (default: -1, the last)")
-    parser.add_argument("--port", type=int, default=PORT, help=f"port of the page, 0: any (default: {PORT})")
-    parser.add_argument("--clean", **CLEAN_OPTION, help="let the tab View show what export.py --clean leaves out "
-        "(default: off; 0.05 without a number)")  # fmt: skip
-    parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
-    parser.add_argument("file", nargs="?", default="", metavar="FILE", help=f"model in place of -m: {ANY}")
-    args = parser.parse_args()
-    if args.file and args.model_path:
-        raise UserError(f"-m {args.model_path} has a model of its own; leave {args.file} or -m out")
-    check_clean(args.clean)
-    if args.clean and not args.model_path:
-        raise UserError("--clean needs training views of a model; give the model's folder with -m")
-    before = bool(args.source_path) and not (args.file or args.model_path)
-    if not (args.file or before or args.model_path):
-        raise UserError("no model given; pass a model folder by -m, a file of a model alone, or a scene by -s")
-    args = args if args.file or before else get_combined_args(parser)
-    options, pipeline = model_params.extract(args), pipeline_params.extract(args)
-    check_port(args.port)
-    safe_state(args.quiet)
-    if args.file:
-        scene = of_file(args.file, pipeline)
-    elif before:
-        scene = untrained(options)
-    else:
-        warn_of_background(options)
-        scene = of_folder(options, args)
-    if len(scene.gaussians) == 0:
-        raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
-    oriented = options.source_path if os.path.isdir(options.source_path or "") else ""
-    shown = kept(scene, args, pipeline, options), before, None if args.file else oriented
-    page = Page(args.port, scene, pipeline, options.white_background, scene.halves, *shown)
-    try:
-        raise serve(page)
-    finally:
-        page.stop()
-
+command = applications.command("viewer")
 
 if __name__ == "__main__":
-    run_cli(main)
+    run_cli(command.main)
+else:
+    sys.modules[__name__] = command  # programs that import view.py may replace its functions

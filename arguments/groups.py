@@ -5,7 +5,7 @@ import os
 from collections.abc import Collection
 
 from arguments.param_group import GroupParams, OptionTable
-from splatting.files.json_files import MODEL_JSON
+from groundwork.files.json_files import MODEL_JSON
 from splatting.option import CFG_ARGS, MOST_NEEDED, Option, above, at_least, in_places, one_of, within
 from splatting.registry import appearances, options_of, part_class, strategies
 from utils.system_utils import UserError

@@ -20,7 +20,7 @@ def training_parser() -> tuple[TopicParser, tuple[OptionTable, ...]]:
 
 # fmt: off
 def add_launch_options(parser: argparse.ArgumentParser) -> None:
-    """Add them to a parser. Iterations are those of the schedule (splatting/training/schedule)."""
+    """Add them to a parser. Iterations are those of the schedule (splatting/schedule)."""
     flag, listed = {"action": "store_true"}, {"type": int, "nargs": "+", "metavar": "N"}
 
     def add(name: str, topic: str, **more: Any) -> None:

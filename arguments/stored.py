@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from arguments.groups import OPTIONS, ModelParams
-from splatting.files import json_files
-from splatting.files.json_files import ENLARGEMENT, MODEL_JSON, OFFSET
-from splatting.files.plain_files import plain_text
-from splatting.host.machine import VERSION
+from groundwork.files import json_files
+from groundwork.files.json_files import ENLARGEMENT, MODEL_JSON, OFFSET
+from groundwork.files.plain_files import plain_text
+from groundwork.host.machine import VERSION
 from splatting.option import CFG_ARGS, Value
 from utils.system_utils import UserError, atomic_write
 
@@ -108,7 +108,7 @@ def add_to_model_json(model_path: str | os.PathLike, **entries: Any) -> None:
 
 
 def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
-    """Do as splatting.files.json_files.read_model_json; UserError also for an option of the wrong type."""
+    """Do as groundwork.files.json_files.read_model_json; UserError also for an option of the wrong type."""
     record = json_files.read_model_json(model_path)
     _check_types(Path(model_path) / MODEL_JSON, record, _IN_MODEL_JSON)
     return record

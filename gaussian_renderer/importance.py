@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from gaussian_renderer.scored_views import ScoredViews
+from groundwork.host.progress import Bar
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
-from splatting.host.progress import Bar
 from utils.sh_utils import C0
 
 _SOLID = 1e-3  # least transparency in the derivative by an opacity

@@ -3,9 +3,9 @@
 import contextlib
 from collections.abc import Iterator, Sequence
 
+from groundwork.host.memory import is_out_of_memory, shortage
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
-from splatting.host.memory import is_out_of_memory, shortage
 from utils.system_utils import UserError
 
 

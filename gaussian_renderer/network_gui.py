@@ -18,8 +18,8 @@ from tqdm import tqdm
 
 from gaussian_renderer.network_message import BadMessage, Request, decode, parse
 from gaussian_renderer.network_transfer import ViewerLeft, ViewerLost, readable, receive_message, send_message, set_up
+from groundwork.host.machine import compute_device
 from scene.cameras import MiniCam
-from splatting.host.machine import compute_device
 from utils.system_utils import UserError
 
 PATIENCE = 30.0  # seconds that `read` waits for a viewer that lets training go on, or has not asked for anything yet

@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Callable, Iterable
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 from diff_gaussian_rasterization.scene import check_rays
 
 from scene.cameras import Camera

@@ -13,10 +13,10 @@ from torch import Tensor
 from gaussian_renderer import decisive_for
 from gaussian_renderer.free_view import FRACTIONS, NEAREST, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
+from groundwork.host.progress import Bar
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.sh_bands import cut_bounds, needed_degree
-from splatting.host.progress import Bar
 
 FAINT = -math.log(254) - 1e-4  # logit of opacity 1/255, below which no pixel draws a Gaussian, less some rounding
 WORTH = 0.01  # share of the Gaussians; fewer unseen ones stay, because leaving them out saves little and is a risk

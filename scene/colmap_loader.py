@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 
-from splatting.files.plain_files import encoding_of, not_the_file
+from groundwork.files.plain_files import encoding_of, not_the_file
 from utils.system_utils import UserError, first_line
 
 StrPath = str | os.PathLike

@@ -17,6 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from groundwork.files.folders import cache_folder
+from groundwork.files.image_files import SUFFIXES
+from groundwork.files.plain_files import plain_text
 from scene.colmap_loader import Camera, Image
 from scene.images.masks import NO_MASKS, MaskOptions
 from scene.readers.colmap import colmap_camera, read_colmap
@@ -37,9 +40,6 @@ from scene.readers.point_cloud import fetchPly, storePly, write_point_cloud
 from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
 from scene.readers.start_cloud import SFM, StartOptions
 from scene.readers.transforms import read_blender, read_frames, read_nerfstudio
-from splatting.files.folders import cache_folder
-from splatting.files.image_files import SUFFIXES
-from splatting.files.plain_files import plain_text
 from utils.graphics_utils import BasicPointCloud, focal2fov, fov2focal
 from utils.system_utils import UserError
 

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
+from groundwork.files.json_files import OFFSET, read_model_json
 from scene.gaussians.ply import read_vertices
-from splatting.files.json_files import OFFSET, read_model_json
 from utils.system_utils import UserError, atomic_write, find_iteration, run_cli, saved_ply
 
 _AXES = ("x", "y", "z")

@@ -3,7 +3,7 @@
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.scene import Scene
 from torch import Tensor

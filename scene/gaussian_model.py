@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from groundwork.host.machine import compute_device
 from scene.gaussians import adc, checkpoint, penalty
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam, StepGuard
 from scene.gaussians.attributes import INITIAL_OPACITY
@@ -19,7 +20,6 @@ from scene.gaussians.reference_names import ReferenceNames
 from scene.gaussians.start import start_rows
 from scene.gaussians.table import trainable
 from scene.readers.info import photo_names
-from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func, inverse_sigmoid
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError

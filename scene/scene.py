@@ -12,6 +12,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from groundwork.files.json_files import ENLARGEMENT, OFFSET, read_model_json
+from groundwork.host.machine import compute_device
+from groundwork.ranks.ranks import ALONE, Ranks
 from scene.camera_forms import call_of_either_form
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos, replaced
 from scene.dataset_readers import read_scene, replaced_reader, scene_by
@@ -21,9 +24,6 @@ from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.readers.tracks import enlargement
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
-from splatting.host.machine import compute_device
 from splatting.part import Part
 from splatting.registry import chosen
 from utils.graphics_utils import BasicPointCloud

@@ -10,16 +10,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.scene import Scene
 from torch import Tensor
 
+from groundwork.ranks.rows import BLOCK, PIECE
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import is_spilled, to_host
-from splatting.distributed.rows import BLOCK, PIECE
 from utils.system_utils import UserError
 
 REST = 100  # iterations

@@ -13,12 +13,12 @@ import torch
 from fused_ssim import composite
 from torch import Tensor
 
+from groundwork.host.machine import compute_device
 from scene.images.masks import TRANSPARENT, Cutout, Opaque
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import ImageStore, InMemory, Picture, Size, Source, at_hand, image_device
 from scene.readers.depth_maps import depth_fit
 from scene.readers.info import CameraInfo
-from splatting.host.machine import compute_device
 from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
 
 ZNEAR = 0.01  # ZNEAR and ZFAR only shape the clip depth and cull nothing

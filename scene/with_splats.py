@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from groundwork.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.morton import sort_scattered
@@ -21,7 +22,6 @@ from scene.scene import Scene
 from scene.splats.ply import columns_of
 from scene.splats.reading import is_point_cloud, read_splats
 from scene.splats.splats import Splats, base_colors, drawable, selected
-from splatting.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 

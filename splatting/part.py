@@ -1,12 +1,12 @@
 """The manual of parts: what a feature adds to a training, in one class, which lies in one file.
 
-A part is a subclass of `Part` in splatting/parts/NAME.py, called by NAME in capital words (depth_tv: DepthTv), and a
+A part is a subclass of `Part` in splatting/features/NAME.py, called by NAME in capital words (depth_tv: DepthTv), and a
 line in splatting/registry.py. The place of that line is the part's in the one order of all hooks. No other file names
 it. Hooks are optional; those that a class does not override cost nothing. This module and every NAME.py import nothing
 heavy, as doctor.py reads them where torch is missing: hooks import what they need. A long method lies in a second file
 beside it, NAME_*.py. Functions for commands and other parts are listed by `tools` of splatting/registry.py.
 
-A run (splatting/training/run.py), in the order in which it calls the hooks:
+A run (splatting/run.py), in the order in which it calls the hooks:
 
 check        The options and the checkpoint are read, and the model is empty. Refuse here what can be refused.
 dataset      The photos, cameras and points are found. Scenes that are made without a run call it, too, and the next.
@@ -16,7 +16,7 @@ ready        Model and optimiser exist.
 opened       The log is open, and files may be written. What must be closed goes into run.resources, an ExitStack.
 terms        In each iteration, before its step: what it adds to the loss.
 begins, due, measured, stepped, ended
-             What observers see. The core's own (splatting/training/loop.py) are parts without a name.
+             What observers see. The core's own (splatting/loop.py) are parts without a name.
 changes      Asked in each iteration: whether rows or sizes will change in it.
 after_step   The optimiser has taken its step.
 records      A record of the log is written, or a point of the curve.
@@ -50,16 +50,16 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
-from splatting.host.errors import UserError
+from groundwork.host.errors import UserError
 
 if TYPE_CHECKING:
     from gaussian_renderer.scored_views import ScoredViews
     from scene.cameras import Camera
     from scene.readers.info import CameraInfo, SceneInfo
     from scene.scene import Scene
+    from splatting.iteration import Iteration, Losses, Term
     from splatting.option import Option
-    from splatting.training.iteration import Iteration, Losses, Term
-    from splatting.training.run import Run
+    from splatting.run import Run
 
 Error: TypeAlias = BaseException | None
 Scored: TypeAlias = "tuple[ScoredViews | None, Sequence[Camera]]"  # how, None: as all others; and which views

@@ -6,7 +6,7 @@ from functools import cache
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from splatting.host.errors import UserError
+from groundwork.host.errors import UserError
 from splatting.part import Appearance, Part, Strategy
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ PARTS = (
 @cache
 def part_class(name: str) -> type[Part]:
     """The class of the module `name`: its name in capital words."""
-    return getattr(import_module(f"splatting.parts.{name}"), "".join(map(str.capitalize, name.split("_"))))
+    return getattr(import_module(f"splatting.features.{name}"), "".join(map(str.capitalize, name.split("_"))))
 
 
 def strategies() -> list[str]:
@@ -128,5 +128,5 @@ def tools(name: str) -> list[Callable]:
     pictures(model): files in a model folder that reports show, where they are there.
     prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.
     """
-    modules = [import_module(f"splatting.parts.{part}") for part in PARTS]
+    modules = [import_module(f"splatting.features.{part}") for part in PARTS]
     return [getattr(module, name) for module in modules if hasattr(module, name)]

@@ -7,14 +7,14 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
+import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import pytest
 import torch
 from filelock import FileLock
 from synthetic import make_blender_scene, make_colmap_scene
 
-from splatting.evaluation import curve_recorder
-from splatting.evaluation.error_curve import FIGURE
+from splatting.records import curve_recorder
+from splatting.records.error_curve import FIGURE
 
 # Tests run side by side, a process a core. Those about several threads set their number.
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # of programs that a test starts

@@ -14,7 +14,7 @@ if mine and fault == "code":
     sys.path.insert(0, os.environ["OTHER_CODE"])
 
 # ruff: noqa: E402
-import splatting.host.early  # noqa: F401  isort: skip  (as train.py begins)
+import groundwork.host.early  # noqa: F401  isort: skip  (as train.py begins)
 import signal
 from collections.abc import Callable
 from datetime import timedelta
@@ -22,9 +22,9 @@ from datetime import timedelta
 import torch
 
 import train
-from splatting.distributed import launcher
-from splatting.training.iteration import Iteration
-from splatting.training.run import Run
+from groundwork.ranks import launcher
+from splatting.iteration import Iteration
+from splatting.run import Run
 from utils.system_utils import run_cli
 
 launcher.TIMEOUT = timedelta(seconds=10 if fault == "hang" else 60)

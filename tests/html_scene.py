@@ -5,10 +5,10 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gaussian_renderer.camera_paths.poses import facing
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from scene.splats.splats import Splats
-from splatting.camera_paths.poses import facing
 from utils.sh_utils import C0
 
 UP = Rotation.from_rotvec([0.5, 0.3, 0.9]).apply([0.0, -1.0, 0.0])  # of unit length

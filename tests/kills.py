@@ -25,7 +25,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
+import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import matplotlib.pyplot  # noqa: F401  (here: otherwise every child would start a process that imports it)
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ import torch
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
-from splatting.parts import resume
+from splatting.features import resume
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic import make_blender_scene  # noqa: E402

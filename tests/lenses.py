@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from diff_gaussian_rasterization.lens import Lens as NativeLens
 
+from applications.demo.tracer import View, normalize
 from scene.images.lens import Lens, import_pycolmap
-from splatting.demo.tracer import View, normalize
 
 # Extra parameters in COLMAP's order. At a focal length of 0.75 widths they move the corners by a twentieth or more.
 DISTORTIONS = {

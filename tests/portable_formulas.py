@@ -80,7 +80,7 @@ def philox(counter: Tensor, key: tuple[int, int]) -> Tensor:
 
 
 def random_words(seed: int, stream: int, iteration: int, items: Tensor, draw: int = 0) -> Tensor:
-    """`random_bits` of splatting/deterministic/counter_rng.py."""
+    """`random_bits` of groundwork/deterministic/counter_rng.py."""
     rest = torch.tensor([draw, iteration, int(stream)], dtype=torch.int64, device=items.device)
     counter = torch.cat((items[:, None], rest.expand(len(items), 3)), dim=1)
     return philox(counter, (seed & _MASK, (seed >> 32) & _MASK))

@@ -16,8 +16,8 @@ import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
 
-from splatting.distributed.process_group import SeveralRanks
-from splatting.distributed.ranks import using
+from groundwork.ranks.process_group import SeveralRanks
+from groundwork.ranks.ranks import using
 
 _kept: dict[int, "_Group"] = {}  # by number of processes
 
@@ -42,7 +42,7 @@ class _Group:
             port = free.getsockname()[1]
         # One process imports torch and the code; the others are its forks.
         context = mp.get_context("forkserver")
-        context.set_forkserver_preload(["train", "splatting.distributed.process_group"])
+        context.set_forkserver_preload(["train", "groundwork.ranks.process_group"])
         self._pipes, self._processes = [], []
         for rank in range(size):
             mine, theirs = context.Pipe()

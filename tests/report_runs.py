@@ -1,7 +1,7 @@
 """Runs as report.json lists them, made up."""
 
-from splatting.evaluation.comparison import QUANTITIES
-from splatting.evaluation.error_curve import COLUMNS
+from applications.evaluation.comparison import QUANTITIES
+from splatting.records.error_curve import COLUMNS
 
 
 def curve(*points: tuple[float, float | None, float]) -> list[dict]:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from applications.export.formats import format_of
 from scene.splats.splats import Splats, tidy
-from splatting.exports.formats import format_of
 
 COUNT, FAR = 2000, 7  # splats of `cube`, and the number of the one that lies apart
 _PACKAGES = {".spz": "zstandard", ".usdz": "pxr"}

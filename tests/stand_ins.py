@@ -16,7 +16,7 @@ from unittest import mock
 
 from PIL import Image
 
-from splatting.evaluation.child import Finished, Slot, run_child
+from applications.evaluation.child import Finished, Slot, run_child
 
 
 def _parsed(words: list[str], **options: object) -> argparse.Namespace:

@@ -9,12 +9,12 @@ import torch
 
 from gaussian_renderer import Drawn
 from scene.sleeping import Sleeping
-from splatting.training.steps import captured, graphs
-from splatting.training.steps.captured import CapturedStep
-from splatting.training.steps.faster import FasterSteps
-from splatting.training.steps.fused import FusedStep
-from splatting.training.steps.graphs import Graphs
-from splatting.training.steps.speculative import AHEAD
+from splatting.faster import captured, graphs
+from splatting.faster.captured import CapturedStep
+from splatting.faster.faster import FasterSteps
+from splatting.faster.fused import FusedStep
+from splatting.faster.graphs import Graphs
+from splatting.faster.speculative import AHEAD
 
 
 def fused_iterations(monkeypatch: pytest.MonkeyPatch) -> list[int]:
@@ -95,7 +95,7 @@ def take_as(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
 
     def choose(way: str) -> None:
         chosen = WAYS.get(way, lambda _: FasterSteps())
-        monkeypatch.setattr("splatting.training.loop.faster_steps", chosen)
+        monkeypatch.setattr("splatting.loop.faster_steps", chosen)
         if way == "queued":
             monkeypatch.setattr(Graphs, "_is_usual", lambda *_: False)
 

@@ -8,11 +8,11 @@ from typing import Any
 import torch
 from gaussians import options
 
+from groundwork.ranks.rows import WHOLE
 from scene.gaussians.exposure import Exposures
-from splatting.distributed.rows import WHOLE
 from splatting.part import Strategy
 from splatting.registry import strategy_part
-from splatting.training.schedule import STEADY, Schedule
+from splatting.schedule import STEADY, Schedule
 
 
 def begun(

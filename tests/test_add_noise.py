@@ -9,7 +9,7 @@ from rasterizer_tools import CPU_AND_GPU
 from test_split_positions import _normal
 from torch import Tensor
 
-from splatting.deterministic.counter_rng import Stream
+from groundwork.deterministic.counter_rng import Stream
 
 WHERE = {"seed": 3, "stream": Stream.NOISE, "iteration": 600}
 GATE = {"size": 80.0, "steepness": 100.0, "threshold": 0.005}

@@ -14,16 +14,17 @@ import numpy as np
 import pytest
 from waiting import wait_for
 
-import splatting.findings.training
+import splatting.checks
 import train
+from applications.doctor import advice
+from applications.doctor.model import check_training
 from arguments import OptimizationParams
+from groundwork.files.json_files import write_json
+from groundwork.finding import Severity, note
 from scene.readers.tracks import Track
-from splatting.evaluation.error_curve import COLUMNS, NAME, Row, write_curve
-from splatting.evaluation.training_log import NAME as LOG
-from splatting.files.json_files import write_json
-from splatting.findings import Severity, advice, note
-from splatting.findings.model import check_training
-from splatting.findings.training import check_overfitting
+from splatting.checks import check_overfitting
+from splatting.records.error_curve import COLUMNS, NAME, Row, write_curve
+from splatting.records.training_log import NAME as LOG
 from splatting.registry import tools
 from utils.system_utils import UserError
 
@@ -156,8 +157,8 @@ def test_doctor_repeats_it(tmp_path):
 def test_training_says_it_at_its_end(colmap_scene, tmp_path, capsys, monkeypatch, overfits):
     monkeypatch.setattr(sys, "stdout", sys.stdout)  # training stamps it
     if overfits:
-        monkeypatch.setattr(splatting.findings.training, "gain_since_peak", lambda rows: 1.5)
-        monkeypatch.setattr(splatting.findings.training, "peak", lambda rows: (rows[0], 0.5))
+        monkeypatch.setattr(splatting.checks, "gain_since_peak", lambda rows: 1.5)
+        monkeypatch.setattr(splatting.checks, "peak", lambda rows: (rows[0], 0.5))
     words = ["-s", str(colmap_scene), "-m", str(tmp_path), "--eval", "--iterations", "12", "-r", "32"]
     train.main([*words, "--strategy", "budget", "--disable_viewer", "--test_iterations", "2", "12"])
     last = json.loads((tmp_path / LOG).read_text())[-1]

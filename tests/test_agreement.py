@@ -11,10 +11,10 @@ import pytest
 from photo_room import cam_to_world, camera_centers
 from scipy.optimize import minimize
 
+from applications.convert import mapping
+from applications.convert.findings import is_wrong
 from scene import agreement
-from splatting.findings.capture import is_wrong
-from splatting.findings.fit import check_agreement
-from splatting.sfm import mapping
+from scene.checks.fit import check_agreement
 from utils.system_utils import UserError
 
 COUNT, POINTS = 12, 200

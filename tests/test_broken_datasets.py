@@ -16,8 +16,8 @@ from synthetic import FOCAL, as_text, edit_json, make_blender_scene, make_colmap
 
 from arguments import ModelParams
 from scene import Scene
+from scene.checks.scene import check_scene
 from scene.gaussian_model import GaussianModel
-from splatting.findings.scene import check_scene
 from utils.system_utils import UserError
 
 Change = Callable[[Path], object]  # changes a scene, and may return options of train.py

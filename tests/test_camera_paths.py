@@ -12,12 +12,8 @@ from gaussians import model, pipeline
 from scipy.spatial.transform import Rotation, Slerp
 
 from gaussian_renderer import render
-from gaussian_renderer.free_view import free_view, rotation_matrix
-from scene.cameras import Camera
-from scene.readers.info import CameraInfo
-from scene.readers.tracks import projected
-from splatting.camera_paths.generated import GENERATED, Ellipse, Interpolated, Spiral, visiting_order
-from splatting.camera_paths.keyframes import (
+from gaussian_renderer.camera_paths.generated import GENERATED, Ellipse, Interpolated, Spiral, visiting_order
+from gaussian_renderer.camera_paths.keyframes import (
     CameraPath,
     Keyframe,
     KeyframePath,
@@ -26,7 +22,11 @@ from splatting.camera_paths.keyframes import (
     frame_moment,
     read_camera_path,
 )
-from splatting.camera_paths.poses import Poses, facing, focus_point, ray_through
+from gaussian_renderer.camera_paths.poses import Poses, facing, focus_point, ray_through
+from gaussian_renderer.free_view import free_view, rotation_matrix
+from scene.cameras import Camera
+from scene.readers.info import CameraInfo
+from scene.readers.tracks import projected
 from utils.system_utils import UserError
 
 UP = np.array([0.0, -1.0, 0.0])  # of COLMAP's world, as usual captures have it

@@ -9,12 +9,13 @@ from PIL import Image, ImageFilter
 from scipy.ndimage import gaussian_filter
 
 import train
-from splatting.findings.capture import left_out, lines_of, neighbours_of, of_model, unusable, worth
-from splatting.findings.photos import SHARED_TEXT
-from splatting.sfm import report
-from splatting.sfm.capture import compared, looks_of
-from splatting.sfm.capture_page import write_page
-from splatting.sfm.layout import Layout
+from applications.convert import report
+from applications.convert.capture import compared, looks_of
+from applications.convert.capture_page import write_page
+from applications.convert.findings import lines_of, neighbours_of, of_model, unusable, worth
+from applications.convert.layout import Layout
+from scene.checks.conversion import left_out
+from scene.checks.photos import SHARED_TEXT
 from utils.system_utils import UserError
 
 NAMES = ["a.jpg", "b.jpg", "c.jpg", "d.jpg"]

@@ -50,6 +50,6 @@ def test_cuda_sources_are_all_compiled(tmp_path):
 
 def test_docker_gets_the_commands_and_their_rooms():
     rules = (ROOT / ".dockerignore").read_text().splitlines()
-    needed = {*ROOMS, *(f"{name}.py" for name in COMMANDS)} - {"benchmarks", "integrations", "setup.py"}
+    needed = {*ROOMS, *(f"{name}.py" for name in COMMANDS)} - {"benchmarks", "setup.py"}
     needed |= {"submodules", "requirements.txt", "version.txt", "LICENSE"}
     assert {rule[1:] for rule in rules if rule[:1] == "!"} == needed

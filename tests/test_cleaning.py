@@ -7,17 +7,17 @@ from gaussians import pipeline
 
 import export
 import train
+from applications.demo.make_scene import make_scene
 from benchmarks.exports import cleaning as benchmark
 from benchmarks.exports.cleaning import losses, with_floaters
+from gaussian_renderer.camera_paths.poses import poses_of
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of, splats_of
-from splatting.camera_paths.poses import poses_of
-from splatting.demo.make_scene import make_scene
-from splatting.evaluation.renders import sheet
-from splatting.exports import cleaning
-from splatting.exports.cleaning import Cleaning, clean
+from splatting import cleaning
+from splatting.cleaning import Cleaning, clean
+from splatting.records.renders import sheet
 from utils.system_utils import UserError
 
 MOST, FLOATERS = 0.05, 30

@@ -8,7 +8,7 @@ import pytest
 from report_runs import run_of, set_runs
 
 import train
-from splatting.evaluation.comparison import (
+from applications.evaluation.comparison import (
     compare,
     default_set,
     published_tables,
@@ -17,10 +17,10 @@ from splatting.evaluation.comparison import (
     stand_apart,
     summarise,
 )
-from splatting.evaluation.configs import read_configs, shipped
-from splatting.evaluation.plan import DATASETS
-from splatting.evaluation.report import make_report
-from splatting.evaluation.tables import result_tables
+from applications.evaluation.configs import read_configs, shipped
+from applications.evaluation.plan import DATASETS
+from applications.evaluation.report import make_report
+from applications.evaluation.tables import result_tables
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

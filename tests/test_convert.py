@@ -16,15 +16,15 @@ from synthetic import folder_state
 
 import convert
 import train
+from applications.convert import capture_page, stages
+from applications.convert.colmap import Pycolmap, Settings
+from applications.convert.images import check_images, prepare_images
+from applications.convert.layout import Layout, refuse_foreign_results
+from applications.convert.stages import reconstruction_stages
+from scene.checks.conversion import check_conversion, is_unfinished, left_out
 from scene.dataset_readers import read_scene
 from scene.readers.scene_folder import is_scene
 from scene.readers.tracks import read_tracks
-from splatting.findings.capture import check_conversion, is_unfinished, left_out
-from splatting.sfm import capture_page, stages
-from splatting.sfm.colmap import Pycolmap, Settings
-from splatting.sfm.images import check_images, prepare_images
-from splatting.sfm.layout import Layout, refuse_foreign_results
-from splatting.sfm.stages import reconstruction_stages
 from utils.system_utils import UserError
 
 VIEWS = 8
@@ -145,7 +145,7 @@ def test_the_command_that_trains_can_be_copied(copy, monkeypatch, capsys):
 
 
 def test_the_same_command_gives_the_same_scene(converted, tmp_path):
-    """With one thread; `splatting/sfm/worker.py` says why."""
+    """With one thread; `applications/convert/worker.py` says why."""
     _convert(tmp_path)
 
     def bytes_of(scene: Path) -> dict[str, bytes]:

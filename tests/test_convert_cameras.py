@@ -11,12 +11,12 @@ from photo_room import FOCAL, SIZE, camera_centers, make_photos
 from PIL import ExifTags, Image
 
 import convert
+from applications.convert import cameras
+from applications.convert.findings import of_shared_cameras
+from applications.convert.layout import Layout
+from scene.checks.cameras import check_lenses
 from scene.dataset_readers import read_scene
 from scene.images.exif import Lens, read_lens
-from splatting.findings.cameras import check_lenses
-from splatting.findings.capture import of_shared_cameras
-from splatting.sfm import cameras
-from splatting.sfm.layout import Layout
 
 TAGS = ExifTags.Base
 VIEWS = 10

@@ -14,12 +14,12 @@ from photo_room import camera_centers, make_photos
 from PIL import Image, ImageOps, PngImagePlugin
 
 import convert
+from applications.convert import stages
+from applications.convert.adding import keep_base
+from applications.convert.images import find_panoramas, prepare_images
+from applications.convert.inputs import sort_inputs
+from applications.convert.layout import Layout, image_names
 from scene.images.decode import picture_size
-from splatting.sfm import stages
-from splatting.sfm.adding import keep_base
-from splatting.sfm.images import find_panoramas, prepare_images
-from splatting.sfm.inputs import sort_inputs
-from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
 # Names of files, the formats that Pillow writes for them, and their names for COLMAP: two that meet stay apart.

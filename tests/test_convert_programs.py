@@ -14,11 +14,11 @@ import pycolmap
 import pytest
 from waiting import LIMIT, wait_for
 
-from splatting.sfm import colmap, programs
-from splatting.sfm.colmap import LENS_MODELS, Program, Settings
-from splatting.sfm.layout import Layout
-from splatting.sfm.programs import refuse_while_working, run_programs
-from splatting.sfm.stages import Stage, StageRecord
+from applications.convert import colmap, programs
+from applications.convert.colmap import LENS_MODELS, Program, Settings
+from applications.convert.layout import Layout
+from applications.convert.programs import refuse_while_working, run_programs
+from applications.convert.stages import Stage, StageRecord
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -43,7 +43,7 @@ def test_ctrl_c_ends_the_program_that_works(tmp_path):
 
 def _killed_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, *words: str) -> Path:
     """Call run_programs with a script in a process that is killed once the script has written to the log; the log."""
-    code = "import sys; from pathlib import Path; from splatting.sfm.programs import run_programs; "
+    code = "import sys; from pathlib import Path; from applications.convert.programs import run_programs; "
     code += "run_programs(Path(sys.argv[1]), [sys.argv[2:]], 'Waiting', 1, lambda: 0)"
     log, python = tmp_path / "log", [sys.executable, "-c"]
     command = [*python, code, str(log), *python, script, *words]
@@ -60,7 +60,7 @@ def _killed_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, script: str, 
 def test_a_killed_caller_leaves_no_worker(tmp_path, monkeypatch):
     (tmp_path / "job.json").write_text('{"step": "wait"}')
     script = (
-        "import sys, time; sys.path.insert(0, 'splatting/sfm'); import worker; "
+        "import sys, time; sys.path.insert(0, 'applications/convert'); import worker; "
         "worker.STEPS['wait'] = lambda job: (print('at work', flush=True), time.sleep(600)); "
         "worker.main(sys.argv[1])"
     )

@@ -17,8 +17,8 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 
 import convert
-from splatting.sfm import video as video_module
-from splatting.sfm.layout import Layout
+from applications.convert import video as video_module
+from applications.convert.layout import Layout
 from utils.system_utils import UserError
 
 

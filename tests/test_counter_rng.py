@@ -7,8 +7,8 @@ import torch
 from rasterizer_tools import CPU_AND_GPU
 from scipy import stats
 
-from splatting.deterministic import portable_math
-from splatting.deterministic.counter_rng import Stream, permutation, random_bits, uniform
+from groundwork.deterministic import portable_math
+from groundwork.deterministic.counter_rng import Stream, permutation, random_bits, uniform
 
 F = 0xFFFFFFFF
 

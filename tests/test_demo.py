@@ -9,12 +9,12 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from splatting.demo import make_scene as maker
-from splatting.demo import report
-from splatting.demo.make_scene import make_scene
-from splatting.demo.objects import Ground, Shape, Sphere, Torus, demo_scene
-from splatting.demo.tracer import CAMERAS, ring_views
-from splatting.evaluation.renders import GAIN, GAP, HEADER, contact_sheet
+from applications.demo import make_scene as maker
+from applications.demo import report
+from applications.demo.make_scene import make_scene
+from applications.demo.objects import Ground, Shape, Sphere, Torus, demo_scene
+from applications.demo.tracer import CAMERAS, ring_views
+from splatting.records.renders import GAIN, GAP, HEADER, contact_sheet
 from utils.system_utils import UserError
 
 VIEWS, WIDTH, HEIGHT, POINTS = 12, 80, 60, 600

@@ -13,10 +13,10 @@ from strategies import begun
 
 from scene.gaussian_model import GaussianModel
 from scene.gaussians import density_rules as rules
-from splatting.findings.training import late_reset
+from splatting.checks import late_reset
+from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule
 from splatting.part import Needs
-from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule
-from splatting.training.schedule import Schedule
+from splatting.schedule import Schedule
 from utils.general_utils import build_rotation
 
 EXTENT = 2.0

@@ -13,7 +13,7 @@ import train
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
-from splatting.training import objective
+from splatting import objective
 from utils.system_utils import UserError
 
 BETAS, EPS, RATE = (0.9, 0.999), 1e-15, 0.01
@@ -116,7 +116,7 @@ def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeyp
     """Whether divergence is detected at once, on a save (3) or a change (13, 26), or later, nothing has moved since."""
     options = ["--densify_from_iter", 10, "--densification_interval", 13, "--densify_grad_threshold", 1e-4]
     options += ["--opacity_reset_interval", 26, "--optimizer_type", optimizer]
-    monkeypatch.setattr("splatting.training.run.USUAL", 1)  # else bands follow the number of iterations
+    monkeypatch.setattr("splatting.run.USUAL", 1)  # else bands follow the number of iterations
     _train(colmap_scene, tmp_path / "whole", *options, "--checkpoint_iterations", broken - 1, iterations=broken)
     _nan_loss_in(monkeypatch, broken)
     out = tmp_path / "broken"

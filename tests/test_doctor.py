@@ -16,19 +16,20 @@ from gaussians import pipeline
 from PIL import Image
 from synthetic import HEIGHT, WIDTH, edit_json
 
+import applications.doctor.model
 import doctor
-import splatting.findings.model
+from applications.doctor import environment
+from applications.doctor.model import check_model
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
 from benchmarks.scenes.poses import disturbed
 from gaussian_renderer import render
+from groundwork.finding import Finding, fine
+from scene.checks.cameras import check_extent, of_cameras
+from scene.checks.points import of_points
+from scene.checks.scene import check_dataset
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved
-from splatting.findings import Finding, environment, fine
-from splatting.findings.cameras import check_extent, of_cameras
-from splatting.findings.model import check_model
-from splatting.findings.points import of_points
-from splatting.findings.scene import check_dataset
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 
@@ -296,14 +297,14 @@ def test_models_that_have_not_converged(model, monkeypatch):
     assert any("PSNR of only" in text and "train longer, 3000 iterations" in text for text in problems(lines))
     late = model(iteration=20000)
     assert "dB -> the dataset has problems (only 17 photos)" in str(problems(check_model(late, -1)))
-    monkeypatch.setattr(splatting.findings.model, "check_dataset", lambda *_: [])
+    monkeypatch.setattr(applications.doctor.model, "check_dataset", lambda *_: [])
     assert "dB -> check the poses (x right, y down, z forward)" in str(problems(check_model(late, -1)))
 
 
 @pytest.mark.parametrize("halves", [False, True])
 def test_only_what_is_scored_is_looked_at(model, colmap_scene, monkeypatch, halves):
     """Photos whose right halves are a model's own renders, and whose left halves are nonsense."""
-    monkeypatch.setattr(splatting.findings.model, "_WIDTH", WIDTH)
+    monkeypatch.setattr(applications.doctor.model, "_WIDTH", WIDTH)
     folder = Path(model(filled(opacity=3)))
     if halves:
         _options(folder, train_test_exp=True)

@@ -14,13 +14,13 @@ import torch
 from PIL import Image
 from trainings import train_on
 
-import splatting.findings.model
+import applications.doctor.model
+from applications.demo.make_scene import make_scene
+from applications.doctor.model import check_model
+from groundwork.finding import Severity
 from scene.gaussians.attributes import Rows
 from scene.gaussians.ply import write_ply
 from scene.saved_model import read_model
-from splatting.demo.make_scene import make_scene
-from splatting.findings import Severity
-from splatting.findings.model import check_model
 
 N = 400
 
@@ -133,7 +133,7 @@ def test_opacities_that_were_reset_too_late(folder, monkeypatch):
     records[-1]["lines"] = [said, *records[-1].get("lines", [])]
     log.write_text(json.dumps(records))
     assert _problems(folder) == []  # they did recover
-    monkeypatch.setattr(splatting.findings.model, "UNRECOVERED", 1.0)
+    monkeypatch.setattr(applications.doctor.model, "UNRECOVERED", 1.0)
     assert _problems(folder) == [said.removeprefix("warning: ").replace("; ", " -> ")]
 
 

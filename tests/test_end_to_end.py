@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 from synthetic import folder_state
 
-from splatting.demo.make_scene import make_scene
+from applications.demo.make_scene import make_scene
 
 pytest.importorskip("diff_gaussian_rasterization", reason="the extensions are not built: make test")
 pytestmark = pytest.mark.slow
@@ -92,7 +92,7 @@ def test_scores_of_the_held_out_views(trained, tmp_path):
     # The report averages the PSNRs of three channels of unrounded pixels; the score is one error over 8-bit pixels.
     assert abs(reported - scores["PSNR"]) < 0.5
 
-    said = run("-m", "splatting.demo.report", trained.model)
+    said = run("-m", "applications.demo.report", trained.model)
     assert re.search(rf"scene\s+{ITERATIONS}\s+\d+ s\s+\d+\s+5\s+{scores['PSNR']:.2f} dB\s+{scores['SSIM']:.4f}", said)
     with Image.open(trained.model / "contact_sheet.png") as sheet:
         assert sheet.width > 3 * 120 and sheet.height > 4 * 90

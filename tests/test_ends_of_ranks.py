@@ -11,12 +11,12 @@ from trainings import narrow_scene
 
 import train
 from arguments import ModelParams
+from groundwork.host import machine, torchrun
+from groundwork.ranks.ranks import Ranks, refuse_differences, using
 from scene import Scene
 from scene.gaussian_model import GaussianModel
-from splatting.distributed.ranks import Ranks, refuse_differences, using
-from splatting.host import machine, torchrun
-from splatting.training.agreement import agree_on_options, agree_on_scene
-from splatting.training.folder import newest_checkpoint
+from splatting.agreement import agree_on_options, agree_on_scene
+from splatting.folder import newest_checkpoint
 from utils.system_utils import UserError, atomic_write, run_cli
 
 ROOT = Path(__file__).resolve().parents[1]

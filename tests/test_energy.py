@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import pytest
 
 import train
-from splatting.evaluation.model_folder import training_joules
-from splatting.evaluation.training_log import Stopwatch, TrainingLog
-from splatting.host.energy import joules_counter
+from groundwork.host.energy import joules_counter
+from splatting.records.model_folder import training_joules
+from splatting.records.training_log import Stopwatch, TrainingLog
 
 
 class NvmlError(Exception):
@@ -104,7 +104,7 @@ def test_a_training_writes_its_joules_where_they_are_known(colmap_scene, tmp_pat
     assert _joules(tmp_path / "without") == [None, None]
 
     reads = iter(range(1000))
-    counter = "splatting.training.run.joules_counter"
+    counter = "splatting.run.joules_counter"
     monkeypatch.setattr(counter, lambda gpus: (lambda: float(next(reads))) if gpus == [None] else None)
     train.main([*words, "-m", str(tmp_path / "with")])
     first, last = _joules(tmp_path / "with")

@@ -17,10 +17,12 @@ from synthetic import make_colmap_scene
 
 import render
 import train
+from applications.doctor.model import check_model
 from arguments import ModelParams, OptimizationParams, PipelineParams
 from gaussian_renderer import draw
 from gaussian_renderer import render as render_view
 from scene import Scene
+from scene.checks.scene import check_dataset
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.poses import moved
@@ -29,9 +31,7 @@ from scene.readers.tracks import enlargement
 from scene.reprojection import twist_gradient
 from scene.splats.reading import read_splats
 from scene.with_splats import load_file, splats_of
-from splatting.findings.model import check_model
-from splatting.findings.scene import check_dataset
-from splatting.training.schedule import Schedule
+from splatting.schedule import Schedule
 from utils.graphics_utils import world_to_camera
 
 FACTOR = 2.0**-10  # exact in float32, so that all differences come from constants of the unit

@@ -19,13 +19,11 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import train
 from gaussian_renderer.scored_views import mean_scores
-from splatting.evaluation import curve_recorder
-from splatting.evaluation.curve_recorder import (
-    CurveDrawer,
-    CurveRecorder,
-    curve_points,
-)
-from splatting.evaluation.error_curve import (
+from groundwork.host import clock, memory
+from splatting import objective
+from splatting.records import curve_recorder
+from splatting.records.curve_recorder import CurveDrawer, CurveRecorder, curve_points
+from splatting.records.error_curve import (
     COLUMNS,
     Row,
     best_test,
@@ -36,9 +34,7 @@ from splatting.evaluation.error_curve import (
     whole_sets,
     write_curve,
 )
-from splatting.evaluation.training_log import TrainingLog
-from splatting.host import clock, memory
-from splatting.training import objective
+from splatting.records.training_log import TrainingLog
 from utils.loss_utils import ssim
 from utils.system_utils import UserError
 
@@ -53,7 +49,7 @@ HEADER = (
 @pytest.fixture(autouse=True)
 def draws(monkeypatch):
     """Here, trainings draw their curve (see conftest.py)."""
-    monkeypatch.setattr("splatting.evaluation.curve_recorder.CurveDrawer", CurveDrawer)
+    monkeypatch.setattr("splatting.records.curve_recorder.CurveDrawer", CurveDrawer)
 
 
 def _row(iteration: int, test: float | None, train: float | None = None, **more: float | None) -> Row:
@@ -287,7 +283,7 @@ class TestDrawer:
         assert drawer.finish() is None
         with Image.open(folder / "error_vs_time.png") as image:
             assert min(image.size) > 400
-        code = "import sys; import splatting.evaluation.figures; print('torch' in sys.modules)"
+        code = "import sys; import splatting.records.figures; print('torch' in sys.modules)"
         assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True) == "False\n"
 
     def test_what_goes_wrong_is_told(self, folder, monkeypatch):

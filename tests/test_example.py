@@ -13,9 +13,9 @@ from forks import Done, fork
 ROOT = Path(__file__).resolve().parents[1]
 WITH_EXAMPLE = """
 import sys
-import splatting.parts
+import splatting.features
 import splatting.registry as registry
-splatting.parts.__path__.append("tests/parts/example")
+splatting.features.__path__.append("tests/parts/example")
 registry.PARTS = (*registry.PARTS, "patient", "grey")
 import train
 scene, *words = sys.argv[1:]
@@ -81,7 +81,7 @@ def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
     for room in (
         "arguments",
         "gaussian_renderer",
-        "integrations",
+        "applications",
         "lpipsPyTorch",
         "scene",
         "splatting",
@@ -90,7 +90,7 @@ def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
     ):
         shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("node_modules", "__pycache__"))
     for name in ("grey", "patient"):
-        shutil.copy(ROOT / "tests/parts/example" / f"{name}.py", tmp_path / "splatting/parts")
+        shutil.copy(ROOT / "tests/parts/example" / f"{name}.py", tmp_path / "splatting/features")
     registry = tmp_path / "splatting/registry.py"
     registry.write_text(
         registry.read_text().replace('    "sparse_depth",', '    "grey",\n    "patient",\n    "sparse_depth",')

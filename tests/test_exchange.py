@@ -8,8 +8,8 @@ from torch import Tensor
 
 from gaussian_renderer.over_ranks.bands import Bands
 from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_splats
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.host.read_later import read_later
+from groundwork.host.read_later import read_later
+from groundwork.ranks.ranks import ALONE, Ranks
 
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything
 

@@ -18,6 +18,8 @@ from plyfile import PlyData
 from scipy.spatial import KDTree, cKDTree
 from small_splats import COUNT, FAR, cube, empty_spz, extreme_splats, moved, splats, written
 
+from applications.export import scene_formats
+from applications.export.formats import FORMATS, format_of
 from gaussian_renderer.free_view import rotation_matrix
 from scene.export_world import export_world
 from scene.splats.ply import CHUNK
@@ -35,8 +37,6 @@ from scene.splats.splats import (
 )
 from scene.splats.spz import WRITTEN, packed_spz, write_spz
 from scene.with_splats import model_of, splats_of
-from splatting.exports import scene_formats
-from splatting.exports.formats import FORMATS, format_of
 from utils.sh_utils import C0, sh_basis
 from utils.system_utils import UserError
 

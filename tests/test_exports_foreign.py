@@ -19,13 +19,13 @@ from torch import Tensor
 
 from arguments import PipelineParams
 from gaussian_renderer import render
+from gaussian_renderer.camera_paths.poses import facing, keyframe
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from scene.splats.reading import read_splats
 from scene.splats.splats import Splats, half_rotated, with_sh_degree
 from scene.splats.spz import WRITTEN, write_spz
 from scene.with_splats import model_of
-from splatting.camera_paths.poses import facing, keyframe
 from utils.system_utils import compute_device
 
 pytestmark = pytest.mark.slow

@@ -23,10 +23,10 @@ from plyfile import PlyData
 import train
 from arguments import ModelParams
 from gaussian_renderer import render
+from groundwork.files.image_files import read_plane
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
-from splatting.files.image_files import read_plane
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]

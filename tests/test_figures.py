@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from splatting.evaluation.error_curve import COLUMNS
-from splatting.evaluation.figures import draw_cameras, draw_curve, draw_curves, draw_sizes
-from splatting.evaluation.report import _from_above
+from applications.evaluation.report import _from_above
+from splatting.records.error_curve import COLUMNS
+from splatting.records.figures import draw_cameras, draw_curve, draw_curves, draw_sizes
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
 

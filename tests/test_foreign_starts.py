@@ -19,6 +19,9 @@ from small_splats import splats, written
 import export
 import render
 import train
+from applications.export.formats import format_of
+from applications.export.reading import read_any
+from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
 from gaussian_renderer.importance import most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from scene.gaussian_model import GaussianModel
@@ -29,9 +32,6 @@ from scene.saved_model import find_save, load_saved, read_model
 from scene.splats.reading import is_point_cloud, read_splats
 from scene.splats.splats import Splats, selected
 from scene.with_splats import model_of, splats_of
-from splatting.camera_paths.keyframes import CameraPath, Keyframe
-from splatting.exports.formats import format_of
-from splatting.exports.reading import read_any
 from utils.sh_utils import C0
 from utils.system_utils import UserError
 

@@ -23,14 +23,14 @@ from synthetic import folder_state
 from waiting import LIMIT, wait_for
 
 import full_eval
+from applications.evaluation import report as report_module
+from applications.evaluation.child import Finished, Slot, run_child
+from applications.evaluation.plan import DATASETS, dataset_scenes, photos_of
 from arguments import write_cfg_args
-from splatting.evaluation import report as report_module
-from splatting.evaluation.child import Finished, Slot, run_child
-from splatting.evaluation.figures import draw_curves
-from splatting.evaluation.model_folder import SCHEDULE, shorter_ends_there
-from splatting.evaluation.plan import DATASETS, dataset_scenes, photos_of
-from splatting.evaluation.renders import GAIN, ComparedViews
-from splatting.host.interrupt import DeferredInterrupt
+from groundwork.host.interrupt import DeferredInterrupt
+from splatting.records.figures import draw_curves
+from splatting.records.model_folder import SCHEDULE, shorter_ends_there
+from splatting.records.renders import GAIN, ComparedViews
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError
 
@@ -267,7 +267,7 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
     (attic / "slow").touch()
     model.mkdir(parents=True)
     program = (  # what full_eval.py does of this, without its imports
-        "import sys; from pathlib import Path; from splatting.files.folders import locked; import stand_ins\n"
+        "import sys; from pathlib import Path; from groundwork.files.folders import locked; import stand_ins\n"
         "with locked(Path(sys.argv[1]), 'full_eval.py', 'process {process}', '--output_path', inherited=True):\n"
         "    stand_ins.run_as_programs(['', 'train.py', *sys.argv[2:]])"
     )

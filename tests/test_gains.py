@@ -5,9 +5,9 @@ import pytest
 from report_runs import run_of
 from scipy import stats
 
-from splatting.evaluation.gains import gains, holm, interval, verdict
-from splatting.evaluation.report import make_report
-from splatting.evaluation.tables import gains_table
+from applications.evaluation.gains import gains, holm, interval, verdict
+from applications.evaluation.report import make_report
+from applications.evaluation.tables import gains_table
 
 
 @pytest.mark.parametrize("seed", range(5))

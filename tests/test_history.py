@@ -18,9 +18,9 @@ from waiting import wait_for
 
 import train
 from arguments import add_to_model_json, read_model_json, write_cfg_args
-from splatting.evaluation.error_curve import COLUMNS, read_curve, write_curve
-from splatting.files.folders import locked, remove_temporary_files
-from splatting.training.folder import check_folder, continue_records, folder_of, own_folder, records_kept
+from groundwork.files.folders import locked, remove_temporary_files
+from splatting.folder import check_folder, continue_records, folder_of, own_folder, records_kept
+from splatting.records.error_curve import COLUMNS, read_curve, write_curve
 from utils.system_utils import UserError, atomic_write
 
 CURVE, LOG = "error_vs_time.csv", "train_log.json"
@@ -296,7 +296,7 @@ def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
     with atomic_write(tmp_path / name) as temporary:
         temporary.touch()
         assert not remove_temporary_files(tmp_path)  # this process lives
-        monkeypatch.setattr("splatting.files.folders._runs", lambda process: process != os.getpid())
+        monkeypatch.setattr("groundwork.files.folders._runs", lambda process: process != os.getpid())
         assert remove_temporary_files(tmp_path) == [temporary]
         temporary.touch()
 

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from synthetic import edit_json, make_blender_scene, make_nerfstudio_scene, read
 from trainings import train_on
 
+from applications.evaluation.results import _split
 from scene.readers.holdout import split
 from scene.readers.info import CameraInfo
-from splatting.evaluation.results import _split
 from utils.graphics_utils import focal2fov
 from utils.system_utils import UserError
 

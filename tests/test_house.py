@@ -12,7 +12,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "setup", "view")
-ROOMS = ("arguments", "benchmarks", "gaussian_renderer", "integrations", "splatting", "lpipsPyTorch", "scene", "utils")
+ROOMS = (
+    *("applications", "arguments", "benchmarks", "gaussian_renderer", "groundwork", "lpipsPyTorch", "scene"),
+    *("splatting", "utils"),
+)
 BENCHMARKS = ("accuracy", "exports", "kernels", "parallel", "peers", "scenes")
 CSRC = ROOT / "submodules"
 LONGEST = 60  # lines of a function
@@ -22,29 +25,33 @@ LONGEST = 60  # lines of a function
 FLOORS = (
     *(("benchmarks.gate",), tuple(f"benchmarks.{name}" for name in BENCHMARKS), ("benchmarks.harness",)),
     ("benchmarks.workloads",),
-    ("benchmarks", "integrations", "full_eval"),
-    ("train",),
-    ("convert", "doctor", "export", "metrics", "render", "setup", "view"),
-    ("splatting.demo", "splatting.exports", "splatting.sfm"),
-    ("splatting.parts",),
-    ("splatting.training",),
-    ("splatting.findings", "splatting.viewer"),
-    ("splatting.camera_paths", "splatting.evaluation"),
+    ("benchmarks",),
+    COMMANDS,
+    ("applications.evaluation", "applications.nerfbaselines", "applications.viewer"),
+    ("applications.convert", "applications.demo", "applications.doctor", "applications.export"),
+    ("applications",),
+    ("splatting.commands",),
+    ("splatting.features",),
+    ("splatting",),
+    ("splatting.records",),
     ("arguments",),
     ("lpipsPyTorch", "utils.camera_utils", "utils.make_depth_scale"),  # names of the reference for what lies below
+    ("scene.checks",),
+    ("gaussian_renderer.camera_paths",),
     ("gaussian_renderer",),
     ("scene",),
     ("scene.splats",),
     ("scene.readers",),
     ("scene.colmap_loader", "scene.gaussians", "scene.images"),
-    ("splatting.registry",),  # finds splatting.parts by their names
+    ("splatting.registry",),  # finds splatting.features by their names
     ("splatting.option", "splatting.part"),
     ("utils",),
-    ("splatting.files",),
-    ("splatting.distributed",),
-    ("splatting.deterministic",),
-    ("splatting.host",),
-    ("splatting",),
+    ("groundwork.applications", "groundwork.finding"),
+    ("groundwork.files",),
+    ("groundwork.ranks",),
+    ("groundwork.deterministic",),
+    ("groundwork.host",),
+    ("groundwork",),
 )
 LEVEL = {room: level for level, floor in enumerate(FLOORS) for room in floor}
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from html_scene import CENTRE, FOV, UP, balls, cameras
 
+from applications.export import html, vendor
+from applications.export.html import settings, turn_upright, up_of, write_html
+from applications.export.notes import Note, Notes
+from gaussian_renderer.camera_paths.generated import Ellipse
+from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
+from gaussian_renderer.camera_paths.poses import poses_of
 from scene.splats.ply import read_compressed_ply
-from splatting.camera_paths.generated import Ellipse
-from splatting.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
-from splatting.camera_paths.poses import poses_of
-from splatting.exports import html, vendor
-from splatting.exports.html import settings, turn_upright, up_of, write_html
-from splatting.exports.notes import Note, Notes
 from utils.system_utils import UserError
 
 # Addresses in the viewer's code. It asks for none of them here: those of PlayCanvas and Khronos are in texts, SVG is a

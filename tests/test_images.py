@@ -11,13 +11,13 @@ import torch
 from icc import cmyk_profile, grey_profile, rgb_profile, to_srgb
 from PIL import Image, PngImagePlugin
 
+from applications.convert import worker
+from applications.convert.images import check_images, prepare_images
+from applications.convert.layout import Layout, image_names
+from groundwork.files import color_profiles
 from scene.images.decode import decode, picture_size
 from scene.images.masks import Mask
 from scene.images.sizes import training_size
-from splatting.files import color_profiles
-from splatting.sfm import worker
-from splatting.sfm.images import check_images, prepare_images
-from splatting.sfm.layout import Layout, image_names
 from utils.system_utils import UserError
 
 

@@ -6,14 +6,14 @@ from gaussians import model, pipeline
 
 import export
 import train
+from applications.demo.make_scene import make_scene
 from gaussian_renderer.blending import weighted_sums
+from gaussian_renderer.camera_paths.without_scene import circle
 from gaussian_renderer.importance import change_without, most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from scene.splats.reading import read_splats
-from splatting.camera_paths.without_scene import circle
-from splatting.demo.make_scene import make_scene
 
 VIEWS = ScoredViews(pipeline(), torch.zeros(3), False)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from splatting.host.interrupt import DeferredInterrupt
+from groundwork.host.interrupt import DeferredInterrupt
 from utils.system_utils import Terminated
 
 ROOT = Path(__file__).parents[1]
@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 WORK = """
 import sys, time
 from pathlib import Path
-from splatting.host.interrupt import DeferredInterrupt
+from groundwork.host.interrupt import DeferredInterrupt
 with DeferredInterrupt() as interrupt:
     print("ready", flush=True)
     deadline = time.monotonic() + 60
@@ -57,7 +57,7 @@ def test_a_second_hangup_is_not_impatience():
 
 def test_nohup_is_respected():
     program = (
-        "import os, signal; from splatting.host.interrupt import DeferredInterrupt\n"
+        "import os, signal; from groundwork.host.interrupt import DeferredInterrupt\n"
         "with DeferredInterrupt() as interrupt: os.kill(os.getpid(), signal.SIGHUP); print(interrupt.requested)"
     )
     command = ["sh", "-c", 'trap \'\' HUP; exec "$0" -c "$1"', sys.executable, program]

@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 MIB = 20  # of a block; four of them are more than glibc keeps by itself
 PROGRAM = f"""
-import splatting.host.early
+import groundwork.host.early
 import ctypes, resource
 
 libc = ctypes.CDLL(None)

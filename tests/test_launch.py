@@ -139,7 +139,7 @@ def test_ranks_with_other_code_are_refused(colmap_scene, tmp_path):
     with (other / "splatting" / "training" / "schedule.py").open("a") as file:
         file.write("# changed\n")
     done = launch_fault(colmap_scene, tmp_path, "code 1 0", OTHER_CODE=str(other))
-    said = "error: rank 1 differs from rank 0 in splatting/training/schedule.py; give all ranks the same files"
+    said = "error: rank 1 differs from rank 0 in splatting/schedule.py; give all ranks the same files"
     assert done.status != 0 and done.errors == [said]  # of rank 0, for all
     assert not (tmp_path / "out").exists()
 

@@ -20,7 +20,7 @@ DEADLINE = 180  # seconds; the slowest takes some ten, most of them to start
 CALL = """
 import sys
 sys.path[:0] = ["tests", "."]
-import splatting.host.openmp
+import groundwork.host.openmp
 import test_long_lists_cuda
 """
 WANTED = [name in (*PARAMETERS, "means2d") for name in GRADIENTS]

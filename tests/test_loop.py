@@ -12,12 +12,12 @@ import torch
 from tqdm import tqdm
 
 import train
-from splatting.host.progress import Bar, in_threads
+from groundwork.host.progress import Bar, in_threads
+from splatting.log import ProgressBar
+from splatting.loop import standard_observers
+from splatting.objective import LossWatch
 from splatting.part import Part, Strategy
-from splatting.training.log import ProgressBar
-from splatting.training.loop import standard_observers
-from splatting.training.objective import LossWatch
-from splatting.training.schedule import Schedule
+from splatting.schedule import Schedule
 
 ITERATIONS = 24
 ROOT = Path(__file__).parents[1]
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def _without_bands(monkeypatch) -> None:
     """No raise of the SH degree is due in iterations as few as these."""
-    monkeypatch.setattr("splatting.training.run.USUAL", 1)
+    monkeypatch.setattr("splatting.run.USUAL", 1)
 
 
 class Recorder(Part):
@@ -116,7 +116,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
             assert self._gaussians.get_xyz.grad is None
             calls.append(("after_step", step.iteration))
 
-    monkeypatch.setattr("splatting.training.run.strategy_part", lambda name: Other())
+    monkeypatch.setattr("splatting.run.strategy_part", lambda name: Other())
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)
@@ -141,7 +141,7 @@ def test_backward_runs_on_the_callers_thread(colmap_scene, tmp_path, monkeypatch
 def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeypatch):
     """Programs that import train.py as a module put their own in its place. Its seconds are none of training."""
     reported, clock = [], time.perf_counter
-    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + 1000 * len(reported))
+    monkeypatch.setattr("splatting.records.training_log.running_seconds", lambda: clock() + 1000 * len(reported))
 
     def report(writer, iteration: int, *_: object) -> dict[str, float]:
         reported.append(iteration)
@@ -161,7 +161,7 @@ def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeyp
 @pytest.mark.parametrize("seconds", [0.0, 4.0])
 def test_a_log_gets_a_line_in_ten_seconds_and_a_last_one(monkeypatch, seconds):
     log, now = io.StringIO(), iter(count(0.0, seconds))
-    monkeypatch.setattr("splatting.host.progress.time", SimpleNamespace(monotonic=lambda: next(now)))
+    monkeypatch.setattr("groundwork.host.progress.time", SimpleNamespace(monotonic=lambda: next(now)))
     for _ in Bar(range(30), file=log, desc="Looking", mininterval=0, miniters=1):
         tqdm.write("other", file=log)
     lines = [line for line in log.getvalue().split("\n") if line != "other"]
@@ -182,7 +182,11 @@ def test_work_in_threads_is_one_line_of_a_log_wherever_it_is():
     log = io.StringIO()
     assert in_threads(lambda number: 2 * number, range(50), file=log, mininterval=0) == [*range(0, 100, 2)]
     assert log.getvalue().count("\n") == 1 and "\r" not in log.getvalue()
-    code = [path for room in ("scene", "splatting", "utils") for path in (ROOT / room).rglob("*.py")]
+    code = [
+        path
+        for room in ("applications", "groundwork", "scene", "splatting", "utils")
+        for path in (ROOT / room).rglob("*.py")
+    ]
     assert [path.name for path in code if "tqdm.contrib" in path.read_text()] == ["progress.py"]
 
 

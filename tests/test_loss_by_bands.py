@@ -13,7 +13,7 @@ from torch import Tensor
 from gaussian_renderer.over_ranks import bands
 from gaussian_renderer.over_ranks.band import surroundings, whole_image
 from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_processed, row_widths
-from splatting.distributed.ranks import Ranks, ranks
+from groundwork.ranks.ranks import Ranks, ranks
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
 CASES = [

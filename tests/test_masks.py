@@ -23,7 +23,7 @@ from scene import Scene
 from scene.images.decode import decode
 from scene.images.masks import TRANSPARENT, Mask, MaskOptions, find_masks
 from scene.readers.photos import _check_mask
-from splatting.training.watch import MaskWatch
+from splatting.watch import MaskWatch
 from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError

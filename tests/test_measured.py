@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatting.files.measured import measured_record
-from splatting.files.similarity import Similarity
+from groundwork.files.measured import measured_record
+from groundwork.files.similarity import Similarity
 from utils.system_utils import UserError
 
 TURN = Rotation.from_euler("xyz", [0.3, 0.5, -0.7]).as_matrix()  # from a frame whose y is down to the scene's world

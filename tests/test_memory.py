@@ -10,12 +10,11 @@ import torch
 from gaussians import model, needs_59_values, options
 
 import train
+from groundwork.host import memory
+from groundwork.host.memory import free_memory, gib, is_out_of_memory
 from scene.images import decode
-from splatting.findings import resources
-from splatting.findings.resources import training_bytes
-from splatting.host import memory
-from splatting.host.memory import free_memory, gib, is_out_of_memory
-from splatting.training import loop
+from splatting import loop, resources
+from splatting.resources import training_bytes
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

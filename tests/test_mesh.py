@@ -16,19 +16,19 @@ from scipy.spatial.transform import Rotation
 
 import export
 import train
+from applications.demo.make_scene import make_scene
+from applications.export import html, mesh
+from applications.export.formats import Around, format_of
+from applications.export.mesh import Mesh, fewer, measure, mesh_of, vertex_normals, volume_of, zero_level
+from applications.export.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims, whole_parts
+from applications.export.mesh_files import write_ply_mesh
+from applications.export.surfaces import Surfaces, pinholes
 from benchmarks.exports import mesh as benchmark
 from gaussian_renderer.median_depth import surface_of
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
 from scene.splats.splats import Splats
 from scene.with_splats import model_of
-from splatting.demo.make_scene import make_scene
-from splatting.exports import html, mesh
-from splatting.exports.formats import Around, format_of
-from splatting.exports.mesh import Mesh, fewer, measure, mesh_of, vertex_normals, volume_of, zero_level
-from splatting.exports.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims, whole_parts
-from splatting.exports.mesh_files import write_ply_mesh
-from splatting.exports.surfaces import Surfaces, pinholes
 from utils.sh_utils import C0
 from utils.system_utils import UserError
 
@@ -240,8 +240,8 @@ def read_by_trimesh(path: Path) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("ending", ["glb", "obj", "usdz"])
 def test_other_programs_read_meshes_with_their_textures(tmp_path, monkeypatch, ending, ball, of_two_halves):
-    monkeypatch.setattr("splatting.exports.mesh.measure", lambda *_: ())
-    monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (of_two_halves, ""))
+    monkeypatch.setattr("applications.export.mesh.measure", lambda *_: ())
+    monkeypatch.setattr("applications.export.mesh.mesh_of", lambda *_: (of_two_halves, ""))
     path = tmp_path / f"a ball.mesh.{ending}"
     entry = format_of(path)
     for _ in range(2):  # its own files are not in its way

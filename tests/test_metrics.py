@@ -14,7 +14,7 @@ from PIL import Image
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 import metrics
-from splatting.evaluation.renders import GAIN, INCOMPLETE
+from splatting.records.renders import GAIN, INCOMPLETE
 from utils.system_utils import UserError, compute_device, run_cli
 
 FILES = ("results.json", "per_view.json", "metrics_info.json")

@@ -8,9 +8,9 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
+from applications.convert.findings import is_folded, is_wrong, only_turned
 from scene.rotation_only import rotation_error
 from scene.unmatched import find_cover, find_overlaps
-from splatting.findings.capture import is_folded, is_wrong, only_turned
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 240.0
 HALF = np.array([2.5, 1.25, 2.0])  # of a room, in units

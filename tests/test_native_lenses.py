@@ -16,11 +16,11 @@ import metrics
 import render
 import train
 from gaussian_renderer import rasterizer_settings
+from gaussian_renderer.camera_paths.poses import poses_of
 from scene import Scene
+from scene.checks.scene import check_dataset
 from scene.images.lens import Lens, pinhole_of
 from scene.readers.start_cloud import random_in_frusta
-from splatting.camera_paths.poses import poses_of
-from splatting.findings.scene import check_dataset
 from utils.system_utils import UserError
 
 PANORAMA = ("EQUIRECTANGULAR", (WIDTH, HEIGHT))

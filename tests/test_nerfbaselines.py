@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from lenses import opencv_pixels
 
+from applications.nerfbaselines.datasets import MODELS, scene_of, view_of
 from arguments.launch import launch_options
-from integrations.nerfbaselines.datasets import MODELS, scene_of, view_of
 from scene.readers.start_cloud import OWN_POINTS
 
 pycolmap = pytest.importorskip("pycolmap")
-SPEC = Path(__file__).resolve().parents[1] / "integrations" / "nerfbaselines" / "spec.py"
+SPEC = Path(__file__).resolve().parents[1] / "applications" / "nerfbaselines" / "spec.py"
 
 
 class Cameras(SimpleNamespace):
@@ -70,11 +70,11 @@ def method(monkeypatch):
     stand_in.Method = object
     stand_in.register = lambda spec: stand_in.__dict__.setdefault("specs", []).append(spec)
     monkeypatch.setitem(sys.modules, "nerfbaselines", stand_in)
-    monkeypatch.delitem(sys.modules, "integrations.nerfbaselines.method", raising=False)
-    import integrations.nerfbaselines.method as module
+    monkeypatch.delitem(sys.modules, "applications.nerfbaselines.method", raising=False)
+    import applications.nerfbaselines.method as module
 
     yield module
-    sys.modules.pop("integrations.nerfbaselines.method", None)
+    sys.modules.pop("applications.nerfbaselines.method", None)
 
 
 def trained(method, steps, **more):
@@ -154,7 +154,7 @@ def test_lenses_project_as_colmap(model):
 def test_the_spec_of_the_package_names_the_method_and_its_presets(method):
     runpy.run_path(str(SPEC))
     (spec,) = sys.modules["nerfbaselines"].specs
-    assert spec["method_class"] == "integrations.nerfbaselines.method:GaussianSplatting"
+    assert spec["method_class"] == "applications.nerfbaselines.method:GaussianSplatting"
     for preset in spec["presets"].values():
         method.parse(method.words_of({k: v for k, v in preset.items() if not k.startswith("@")}))
     info = method.GaussianSplatting.get_method_info()

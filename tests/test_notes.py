@@ -7,9 +7,9 @@ import pytest
 from html_scene import CENTRE, UP, balls, cameras
 from test_html_export import Page
 
-from splatting.exports.html import write_html
-from splatting.exports.notes import Note, Notes, read_notes
-from splatting.exports.page_start import check_note
+from applications.export.html import write_html
+from applications.export.notes import Note, Notes, read_notes
+from applications.export.page_start import check_note
 from utils.system_utils import UserError
 
 CONTENT = """# Two balls

@@ -20,7 +20,7 @@ KEPT += ("transmittance",)
 REPORT = """
 import sys
 sys.path[:0] = ["tests", "."]
-import splatting.host.openmp
+import groundwork.host.openmp
 from fuzz.operators import outcomes
 for outcome in outcomes():
     print("|".join(outcome), flush=True)

@@ -10,12 +10,12 @@ import pytest
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
+from applications.convert.georeference import level_up
+from applications.convert.layout import Layout
+from applications.convert.orienting import orient, said_of
+from gaussian_renderer.camera_paths.poses import facing
+from groundwork.files.similarity import Similarity, read_orientation
 from scene.images.exif import _gps, read_place
-from splatting.camera_paths.poses import facing
-from splatting.files.similarity import Similarity, read_orientation
-from splatting.sfm.georeference import level_up
-from splatting.sfm.layout import Layout
-from splatting.sfm.orienting import orient, said_of
 from utils.system_utils import UserError
 
 TILT = Rotation.from_rotvec([0.5, 1.3, -0.4]).as_matrix()  # from the level frame (x east, y down, z north) to the world

@@ -12,10 +12,10 @@ import pytest
 from PIL import Image
 from test_house import ROOT, _module, _python, _tree
 
-from splatting.evaluation.stages import _remove_stop
-from splatting.exports.sog import PROGRAM
-from splatting.files.ours import digest_of, is_ours, write_picture
-from splatting.host.programs import find_program
+from applications.evaluation.stages import _remove_stop
+from applications.export.sog import PROGRAM
+from groundwork.files.ours import digest_of, is_ours, write_picture
+from groundwork.host.programs import find_program
 from utils.system_utils import UserError
 
 SELF = "runs sys.executable with files of this repository"
@@ -25,52 +25,52 @@ OWN = "what this process itself has just made"
 WORK = "a reserved name in `distorted`, or in a scene that convert.py has made; refuse_foreign_results knows"
 # Every function that looks for, runs or deletes something, and why it may.
 MAY = {
-    "splatting.host.programs.find_program": "the one place that looks for programs",
-    "splatting.host.machine._output": FOUND,
-    "splatting.findings.environment._nvidia_gpu": FOUND,
-    "splatting.exports.sog.fault_of": FOUND,
-    "splatting.exports.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
-    "splatting.camera_paths.video.write_video": FOUND,
-    "splatting.sfm.colmap._output": FOUND,
-    "splatting.sfm.programs._run": FOUND,  # COLMAP, or worker.py
-    "splatting.sfm.video._warn_if_cut": "runs the ffmpeg that imageio-ffmpeg finds, without relative entries of PATH",
-    "splatting.sfm.video._filters": "the same",
-    "splatting.sfm.video.find_streams": "the same",
-    "splatting.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
-    "splatting.host.machine.facts_asked": SELF,
-    "splatting.findings.advice._trained": SELF,
-    "splatting.evaluation.child.run_child": SELF,
-    "splatting.evaluation.curve_recorder.begin": SELF,
+    "groundwork.host.programs.find_program": "the one place that looks for programs",
+    "groundwork.host.machine._output": FOUND,
+    "applications.doctor.environment._nvidia_gpu": FOUND,
+    "applications.export.sog.fault_of": FOUND,
+    "applications.export.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
+    "gaussian_renderer.camera_paths.video.write_video": FOUND,
+    "applications.convert.colmap._output": FOUND,
+    "applications.convert.programs._run": FOUND,  # COLMAP, or worker.py
+    "applications.convert.video._warn_if_cut": "runs imageio-ffmpeg's ffmpeg, without relative entries of PATH",
+    "applications.convert.video._filters": "the same",
+    "applications.convert.video.find_streams": "the same",
+    "applications.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
+    "groundwork.host.machine.facts_asked": SELF,
+    "applications.doctor.advice._trained": SELF,
+    "applications.evaluation.child.run_child": SELF,
+    "splatting.records.curve_recorder.begin": SELF,
     # Also that of BuildModules, which empties setuptools' build folder of modules.
     "submodules.common.build_extension.run": "runs compilers, where BuildBackends left relative entries of PATH out",
     "submodules.common.build_extension.find_compiler": "the same",
     "submodules.common.build_extension.find_nvcc": "the same",
     "submodules.common.build_extension.toolkit_root": "the same",
-    "splatting.exports.beside._remove": "a folder that is_ours, and that no other JSON file names",
-    "splatting.sfm.video.remove_frames": "a picture that is_ours, below `input`",
-    "splatting.exports.beside.with_folder": OWN,
-    "splatting.exports.streamed.write_lod_meta": OWN,
-    "splatting.demo.make_scene.make_scene": OWN,  # and an empty folder
-    "integrations.nerfbaselines.method._begin": OWN,
-    "splatting.files.writing.atomic_write": OWN,
-    "splatting.files.folders.locked": OWN,
-    "splatting.files.folders.remove_temporary_files": "files with names of atomic_write, whose process has ended",
-    "splatting.files.image_files.remove_leftovers": "numbered renders in a model folder",
-    "render.write_views": MODEL,
-    "render.render_set": MODEL,
-    "render.render_sets": MODEL,
-    "splatting.evaluation.error_curve.continue_curve": MODEL,
-    "splatting.evaluation.stages._remove_stop": MODEL,
-    "splatting.training.run.open": MODEL,
-    "splatting.parts.resume.opened": MODEL,
-    "splatting.parts.resume.ended": MODEL,
-    "splatting.parts.resume._continued": MODEL,
-    "splatting.parts.robust_mask_residuals.write_masks": MODEL,
-    "splatting.sfm.adding.forget_base": WORK,
-    "splatting.sfm.adding.keep_base": WORK,
-    "splatting.sfm.mapping.map_photos": WORK,
-    "splatting.sfm.colmap.copy_database": WORK,
-    "splatting.sfm.stages._remove": WORK,
+    "applications.export.beside._remove": "a folder that is_ours, and that no other JSON file names",
+    "applications.convert.video.remove_frames": "a picture that is_ours, below `input`",
+    "applications.export.beside.with_folder": OWN,
+    "applications.export.streamed.write_lod_meta": OWN,
+    "applications.demo.make_scene.make_scene": OWN,  # and an empty folder
+    "applications.nerfbaselines.method._begin": OWN,
+    "groundwork.files.writing.atomic_write": OWN,
+    "groundwork.files.folders.locked": OWN,
+    "groundwork.files.folders.remove_temporary_files": "files with names of atomic_write, whose process has ended",
+    "groundwork.files.image_files.remove_leftovers": "numbered renders in a model folder",
+    "splatting.commands.render.write_views": MODEL,
+    "splatting.commands.render.render_set": MODEL,
+    "splatting.commands.render.render_sets": MODEL,
+    "splatting.records.error_curve.continue_curve": MODEL,
+    "applications.evaluation.stages._remove_stop": MODEL,
+    "splatting.run.open": MODEL,
+    "splatting.features.resume.opened": MODEL,
+    "splatting.features.resume.ended": MODEL,
+    "splatting.features.resume._continued": MODEL,
+    "splatting.features.robust_mask_residuals.write_masks": MODEL,
+    "applications.convert.adding.forget_base": WORK,
+    "applications.convert.adding.keep_base": WORK,
+    "applications.convert.mapping.map_photos": WORK,
+    "applications.convert.colmap.copy_database": WORK,
+    "applications.convert.stages._remove": WORK,
 }
 CALLS = {"rmtree", "unlink", "rmdir", "which", "Popen", "check_call", "check_output", "system", "removedirs"}
 OF_MODULES = {("subprocess", "run"), ("subprocess", "call"), ("os", "remove"), ("os", "popen"), ("torch", "load")}
@@ -189,7 +189,7 @@ def test_a_record_of_others_leads_to_no_other_folder(tmp_path):
 def test_figures_go_by_no_settings_of_the_current_folder(tmp_path):
     pytest.importorskip("matplotlib")
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\n")
-    code = "from splatting.evaluation.figures import _figure\nfrom matplotlib import rcParams\n"
+    code = "from splatting.records.figures import _figure\nfrom matplotlib import rcParams\n"
     code += "assert rcParams['text.usetex']\n_figure(1, (2, 2), '')\nassert not rcParams['text.usetex']"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)

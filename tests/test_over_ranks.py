@@ -17,7 +17,7 @@ from torch import Tensor
 from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer.over_ranks.band import decisive_in, draw_view
 from gaussian_renderer.over_ranks.rasterize import rasterize_over
-from splatting.distributed.ranks import ranks
+from groundwork.ranks.ranks import ranks
 
 SIZES = [2, 3]
 CAMERA = "viewmatrix", "campos"

@@ -79,7 +79,7 @@ def test_utils_merges_with_a_folder_of_that_name(tmp_path):
     script = """
 import utils.pose_utils
 from utils.general_utils import PILtoTorch
-from splatting.host.machine import compute_device
+from groundwork.host.machine import compute_device
 assert utils.pose_utils.C0 > 0 and len(utils.__path__) >= 2
 print("done")
 """

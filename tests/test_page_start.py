@@ -13,15 +13,15 @@ from test_html_export import Page
 
 import export
 import train
+from applications.export.formats import Around, format_of
+from applications.export.page_start import PICTURE, named, write_preview
 from gaussian_renderer import render
+from gaussian_renderer.camera_paths import without_scene
+from gaussian_renderer.camera_paths.poses import Poses, poses_of
+from gaussian_renderer.camera_paths.start import LEAST, MOST, best_start, narrowed
 from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
-from splatting.camera_paths import without_scene
-from splatting.camera_paths.poses import Poses, poses_of
-from splatting.camera_paths.start import LEAST, MOST, best_start, narrowed
-from splatting.exports import cleaning
-from splatting.exports.formats import Around, format_of
-from splatting.exports.page_start import PICTURE, named, write_preview
+from splatting import cleaning
 from utils.system_utils import UserError
 
 

@@ -17,14 +17,14 @@ from PIL import Image
 
 import convert
 import train
+from applications.convert import pairing, reduced
+from applications.convert.dense_points import more_points
+from applications.convert.layout import Layout, find_images, take_photos_beside
+from applications.convert.pairing import first_pairs, likeness, named_by_id, restore_names, rounds
+from applications.convert.reduced import enlarged, longest_side, reduce_photos
+from applications.convert.stages import Stage, StageRecord
+from scene.checks.conversion import changed_photos, is_unfinished, state_of
 from scene.readers.scene_folder import REPORT, find_capture
-from splatting.findings.capture import changed_photos, is_unfinished, state_of
-from splatting.sfm import pairing, reduced
-from splatting.sfm.dense_points import more_points
-from splatting.sfm.layout import Layout, find_images, take_photos_beside
-from splatting.sfm.pairing import first_pairs, likeness, named_by_id, restore_names, rounds
-from splatting.sfm.reduced import enlarged, longest_side, reduce_photos
-from splatting.sfm.stages import Stage, StageRecord
 from utils.system_utils import UserError
 
 PLACES, EACH = 10, 8  # photos of the same place look alike

@@ -7,8 +7,8 @@ from statistics import fmean
 
 from report_runs import run_of, set_runs
 
-from splatting.evaluation.paper import csv_text, tex_text
-from splatting.evaluation.report import make_report
+from applications.evaluation.paper import csv_text, tex_text
+from applications.evaluation.report import make_report
 
 
 def test_a_row_for_each_run_and_for_each_mean():

@@ -18,30 +18,33 @@ from splatting.registry import PARTS, part_class, states_in, strategies, tools
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDER = ROOT / "splatting" / "parts"
-ROOMS = ("arguments", "gaussian_renderer", "integrations", "splatting", "scene", "utils")
+FOLDER = ROOT / "splatting" / "features"
+ROOMS = ("applications", "arguments", "gaussian_renderer", "groundwork", "scene", "splatting", "utils")
 NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  # what options are read from
+EVALUATION = "applications/evaluation/command.py"
 KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
-    ("time_budget", "integrations/nerfbaselines/spec.py"),  # a set of options, as a user gives it
-    ("no_curve", "integrations/nerfbaselines/method.py"),
-    ("no_curve", "splatting/findings/advice.py"),  # of a short training
+    ("time_budget", "applications/nerfbaselines/spec.py"),  # a set of options, as a user gives it
+    ("no_curve", "applications/nerfbaselines/method.py"),
+    ("no_curve", "applications/doctor/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
     ("schedule", "scene/gaussians/reference_names.py"),
     *((option, "scene/dataset_readers.py") for option in ("depths", "train_test_exp")),  # what the reference's take
     ("train_test_exp", "scene/cameras.py"),
     *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
-    *((f"exposure_lr_{end}", "full_eval.py") for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
-    ("train_test_exp", "full_eval.py"),
-    ("viewer", "splatting/evaluation/configs.py"),  # nobody would close its page
-    ("viewer", "splatting/exports/vendor.py"),  # a folder
-    ("port", "view.py"),
+    *((f"exposure_lr_{end}", EVALUATION) for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
+    ("train_test_exp", EVALUATION),
+    ("viewer", "applications/evaluation/configs.py"),  # nobody would close its page
+    ("viewer", "applications/export/vendor.py"),  # a folder
+    ("port", "applications/viewer/command.py"),
+    ("viewer", "view.py"),  # the application
+    *((option, "applications/viewer/training_page.py") for option in ("viewer", "paused")),  # the page that it opens
     *((option, "gaussian_renderer/network_gui.py") for option in ("port", "disable_viewer", "viewer")),  # its sentence
     *(
-        (option, f"splatting/{of}.py")  # of own trainings
+        (option, f"applications/{of}.py")  # of own trainings
         for option in ("disable_viewer", "no_last_checkpoint")
-        for of in ("evaluation/stages", "findings/advice")
+        for of in ("evaluation/stages", "doctor/advice")
     ),
-    ("disable_viewer", "integrations/nerfbaselines/method.py"),
+    ("disable_viewer", "applications/nerfbaselines/method.py"),
 }
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
 
@@ -80,7 +83,7 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
     typed = re.compile(rf"--({'|'.join(map(re.escape, sorted(options)))})\b")
     for node in _nodes(path):
         if isinstance(node, ast.ImportFrom):
-            module = re.compile(rf"splatting\.parts\.{name}(_\w+)?(\.|$)")
+            module = re.compile(rf"splatting\.features\.{name}(_\w+)?(\.|$)")
             found = any(module.match(f"{node.module}.{alias.name}") for alias in node.names)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found = node.value in options or typed.search(node.value)
@@ -120,12 +123,12 @@ import splatting.registry as registry
 hidden, *words = sys.argv[1:]
 hidden = hidden.split(",")
 registry.PARTS = tuple(name for name in registry.PARTS if name not in hidden)
-files = [path for name in hidden for path in Path("splatting/parts").glob(f"{name}*.py")]
-sys.modules |= {f"splatting.parts.{path.stem}": None for path in files}
+files = [path for name in hidden for path in Path("splatting/features").glob(f"{name}*.py")]
+sys.modules |= {f"splatting.features.{path.stem}": None for path in files}
 """
 IMPORTED = """
 from importlib import import_module
-left_out = "integrations", *(f"splatting.parts.{name}" for name in hidden)
+left_out = "applications.nerfbaselines", *(f"splatting.features.{name}" for name in hidden)
 for room in words:
     paths = Path(room).rglob("*.py") if Path(room).is_dir() else [Path(room)]
     for path in sorted(paths):

@@ -12,9 +12,9 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 
 import metrics
 import render
+from applications.evaluation import peer_curve
 from benchmarks.peers import curve, gsplat_training
-from splatting.evaluation import peer_curve
-from splatting.evaluation.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
+from splatting.records.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
 from utils.graphics_utils import focal2fov, projection
 from utils.system_utils import UserError
 

@@ -9,21 +9,21 @@ from pathlib import Path
 
 import pytest
 
+from applications.evaluation.configs import read_configs
 from arguments import read_cfg_args, read_model_json
+from gaussian_renderer.camera_paths.keyframes import read_camera_path
+from gaussian_renderer.camera_paths.render_path import path_maker
+from groundwork.files.image_files import read_plane
+from groundwork.files.json_files import read_json, write_json
+from groundwork.files.plain_files import MOST
 from scene.dataset_readers import read_scene
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.gaussians.exposure import read_pretrained
 from scene.images.decode import picture_size
 from scene.readers.point_cloud import read_point_cloud
-from splatting.camera_paths.keyframes import read_camera_path
-from splatting.camera_paths.render_path import path_maker
-from splatting.evaluation.configs import read_configs
-from splatting.evaluation.error_curve import read_curve, read_peer
-from splatting.evaluation.training_log import read_log
-from splatting.files.image_files import read_plane
-from splatting.files.json_files import read_json, write_json
-from splatting.files.plain_files import MOST
-from splatting.parts.time_budget_file import read_schedule
+from splatting.features.time_budget_file import read_schedule
+from splatting.records.error_curve import read_curve, read_peer
+from splatting.records.training_log import read_log
 from utils.lpips_utils import _load_state
 from utils.system_utils import UserError
 

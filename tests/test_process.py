@@ -15,17 +15,17 @@ import torch
 from waiting import wait_for
 
 import train
+from groundwork.host import clock, machine, start
 from scene import Scene
 from scene.gaussians.adam import undecorated
-from splatting.evaluation.training_log import Stopwatch
-from splatting.host import clock, machine, start
+from splatting.records.training_log import Stopwatch
 
 ROOT = Path(__file__).parents[1]
 UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "matplotlib")
 UNUSED += ("pycolmap", "scipy", "skimage", "torchvision", "lpips", "sympy", "networkx", "pandas", "triton")
 LOADED = """
 import sys
-import splatting.host.openmp
+import groundwork.host.openmp
 import torch, numpy, PIL.Image
 before = set(sys.modules)
 import train
@@ -150,7 +150,7 @@ def test_the_gpus_context_is_made_in_a_thread(monkeypatch, initialised, expected
 
 def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
     """In a fresh process, as the extension is found without being imported."""
-    code = "import sys\nfrom splatting.host import start\n"
+    code = "import sys\nfrom groundwork.host import start\n"
     code += "print(start._computes_on_a_gpu(), 'torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     from diff_gaussian_rasterization import has_cuda_kernels
@@ -164,7 +164,7 @@ def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
 # Prints the seconds of some work: by the clock, and by the wall.
 CLOCK = """
 import sys, time
-from splatting.host.clock import running_seconds, tick
+from groundwork.host.clock import running_seconds, tick
 user = lambda: None
 tick(user)
 WORK = {"hold the lock": lambda: sum(range(2 * 10**8)), "read": input}

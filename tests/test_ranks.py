@@ -10,11 +10,11 @@ from forks import fork
 from processes import in_ranks
 
 import train
-from splatting.distributed import process_group
-from splatting.distributed.ranks import ALONE, Ranks, ranks
-from splatting.training.iteration import Iteration
-from splatting.training.run import Run
-from splatting.training.steps.fused import FusedStep
+from groundwork.ranks import process_group
+from groundwork.ranks.ranks import ALONE, Ranks, ranks
+from splatting.faster.fused import FusedStep
+from splatting.iteration import Iteration
+from splatting.run import Run
 
 
 def _talk() -> dict[str, object]:
@@ -98,7 +98,7 @@ def test_a_process_by_itself_is_all_ranks():
 _LEAVE = """
 from pathlib import Path
 import torch.distributed as dist
-from splatting.distributed.process_group import SeveralRanks
+from groundwork.ranks.process_group import SeveralRanks
 dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
 ranks = SeveralRanks()
 ranks.itself = ranks

@@ -16,14 +16,14 @@ from gaussians import model
 from PIL import Image
 
 from arguments import ModelParams, PipelineParams
+from gaussian_renderer.camera_paths import without_scene
+from groundwork.files.image_files import read_plane, to_bytes
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.attributes import attributes
 from scene.gaussians.ply import write_ply
 from scene.saved_model import load_saved
-from splatting.camera_paths import without_scene
-from splatting.evaluation.renders import INCOMPLETE
-from splatting.files.image_files import read_plane, to_bytes
+from splatting.records.renders import INCOMPLETE
 from utils.system_utils import UserError
 
 render = pytest.importorskip("render", reason="the extensions are not built: make test")

@@ -15,13 +15,13 @@ import torch
 from gaussians import model, pipeline
 from PIL import Image
 
+from applications.viewer.untrained import _spheres
+from gaussian_renderer.camera_paths import from_above, render_path, video
+from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle
 from scene.cameras import camera_to_JSON
 from scene.dataset_readers import read_scene
 from scene.with_splats import model_of
-from splatting.camera_paths import from_above, render_path, video
-from splatting.camera_paths.keyframes import CameraPath, Keyframe
-from splatting.camera_paths.without_scene import WithoutScene, circle
-from splatting.viewer.untrained import _spheres
 from utils.system_utils import UserError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="no imageio-ffmpeg: pip install '.[video]'")

@@ -13,7 +13,7 @@ from gaussian_renderer import render
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import Exposures
-from splatting.training import scores as report
+from splatting import scores as report
 from utils.graphics_utils import getProjectionMatrix
 from utils.loss_utils import l1_loss
 from utils.system_utils import UserError

@@ -27,7 +27,7 @@ from test_split_positions import _parents as some_parents
 from torch import Tensor
 
 from benchmarks.workloads.splat_scenes import KINDS, frustum, ordinary
-from splatting.host.machine import instruction_set
+from groundwork.host.machine import instruction_set
 
 ROOT = Path(__file__).resolve().parents[1]
 Results = list[Tensor]

@@ -15,7 +15,7 @@ from trainings import narrow_scene, train_on
 import metrics
 import render
 from arguments import OPTIONS
-from splatting.evaluation.error_curve import read_curve
+from splatting.records.error_curve import read_curve
 
 ITERATIONS = 12
 NEAR = 0.02  # dB; PNGs are rounded to 8 bits, which adds an error of 1/12 of their unit squared

@@ -13,10 +13,10 @@ from trainings import before_steps, train_on
 
 import export
 import render
+from groundwork.host.start import typed_command
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
 from scene.saved_model import find_save, read_model
-from splatting.host.start import typed_command
-from splatting.training.iteration import Iteration
+from splatting.iteration import Iteration
 from utils.system_utils import UserError
 
 PAGES = Path(__file__).parents[1] / "docs" / "api"

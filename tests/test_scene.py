@@ -17,9 +17,9 @@ from synthetic import FakeGaussians, options_of
 
 import scene as scene_package
 import train
+from groundwork.files.json_files import OFFSET
 from scene import Scene
 from scene.dataset_readers import read_scene, sceneLoadTypeCallbacks
-from splatting.files.json_files import OFFSET
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]

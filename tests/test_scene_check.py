@@ -1,4 +1,4 @@
-"""splatting/findings: each fault of photos, cameras and points is named, and nothing is said of sound scenes."""
+"""groundwork/finding: each fault of photos, cameras and points is named, and nothing is said of sound scenes."""
 
 import argparse
 import io
@@ -14,18 +14,18 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 from synthetic import BROWN, HEIGHT, WIDTH, edit_json, make_blender_scene, make_colmap_scene, read
 
+from applications.convert.images import find_masks, find_shared_pixels
+from applications.convert.shared_masks import write_shared_masks
+from groundwork.finding import Finding, Severity
+from scene.checks.photo_files import _same_photos, of_blur
+from scene.checks.photos import check_photos
+from scene.checks.scene import check_dataset, findings, tell
 from scene.gaussians.copies import places_of
 from scene.gaussians.start import start_rows
 from scene.images.decode import decode
 from scene.images.masks import MaskOptions
 from scene.readers.depth_maps import with_depth_maps
 from scene.readers.info import CameraInfo, SceneInfo, exposure_names, local, world_offset
-from splatting.findings import Finding, Severity
-from splatting.findings.photo_files import _same_photos, of_blur
-from splatting.findings.photos import check_photos
-from splatting.findings.scene import check_dataset, findings, tell
-from splatting.sfm.images import find_masks, find_shared_pixels
-from splatting.sfm.shared_masks import write_shared_masks
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 

@@ -10,7 +10,7 @@ import pytest
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 
-from splatting.sfm import database  # noqa: E402
+from applications.convert import database  # noqa: E402
 
 READER = """
 import sqlite3, sys

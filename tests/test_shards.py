@@ -15,11 +15,11 @@ from processes import in_ranks
 from strategies import begun
 from torch import Tensor
 
+from groundwork.ranks.ranks import ranks
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.gaussians.density_rules import logit
 from scene.gaussians.sh_bands import cut_bounds
-from splatting.distributed.ranks import ranks
 from utils.system_utils import UserError
 
 EXTENT, THRESHOLD = 2.0, 2e-4

@@ -14,10 +14,10 @@ from processes import in_ranks
 from trainings import PYRAMID
 
 import train
+from groundwork.ranks.ranks import ranks
+from groundwork.ranks.shared_images import holders
 from scene.images.store import ImageStore
-from splatting.distributed.ranks import ranks
-from splatting.distributed.shared_images import holders
-from splatting.findings import resources
+from splatting import resources
 from utils.system_utils import UserError
 
 LENGTH = (

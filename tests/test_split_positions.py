@@ -11,7 +11,7 @@ from rasterizer_tools import CPU_AND_GPU
 from scipy import stats
 from torch import Tensor
 
-from splatting.deterministic.counter_rng import Stream, random_bits
+from groundwork.deterministic.counter_rng import Stream, random_bits
 
 WHERE = {"seed": 3, "stream": Stream.SPLIT, "iteration": 600, "draw": 1}
 

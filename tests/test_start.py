@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from waiting import LIMIT, wait_for
 
-from splatting.host.start import typed_command
+from groundwork.host.start import typed_command
 
 ROOT = Path(__file__).parents[1]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor")

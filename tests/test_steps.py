@@ -24,15 +24,15 @@ from trainings import (
     whole_result,
 )
 
-from splatting.training import loop, run
-from splatting.training.iteration import Iteration, Losses
-from splatting.training.objective import Objective
-from splatting.training.steps import captured, faster_steps, speculative
-from splatting.training.steps.captured import CapturedStep
-from splatting.training.steps.faster import FasterSteps
-from splatting.training.steps.fused import FusedStep
-from splatting.training.steps.graphs import Graphs
-from splatting.training.steps.recorder import Recorder
+from splatting import loop, run
+from splatting.faster import captured, faster_steps, speculative
+from splatting.faster.captured import CapturedStep
+from splatting.faster.faster import FasterSteps
+from splatting.faster.fused import FusedStep
+from splatting.faster.graphs import Graphs
+from splatting.faster.recorder import Recorder
+from splatting.iteration import Iteration, Losses
+from splatting.objective import Objective
 from utils.system_utils import UserError
 
 pytestmark = needs_fused_step
@@ -204,7 +204,7 @@ def test_a_graph_without_any_memory_is_an_error_and_no_abort(_):
     """Torch allocates as a capture begins; in a process of its own, as the abort would end this one."""
     code = """
 import torch
-from splatting.training.steps.recorder import Recorder
+from splatting.faster.recorder import Recorder
 recorder, word = Recorder(torch.device("cuda")), torch.zeros(1, device="cuda")
 recorder.capture(word.zero_)
 recorder.release()
@@ -275,10 +275,10 @@ def test_a_run_that_is_killed_right_after_an_overflow_resumes_to_the_same_bytes(
     program = """
 import os, signal, sys
 sys.path[:0] = ["tests", "."]
-import splatting.host.openmp
+import groundwork.host.openmp
 from pathlib import Path
 import test_steps
-from splatting.training.steps import speculative
+from splatting.faster import speculative
 replay = speculative.Speculation._replay
 
 def replay_and_die(self, report):

@@ -9,7 +9,7 @@ import pytest
 import torch
 from fuzz import crafted_pickles as crafted
 
-from splatting.files.tensor_files import read_tensors
+from groundwork.files.tensor_files import read_tensors
 
 _DTYPES = [torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16]
 _DTYPES += [torch.int8, torch.uint8, torch.bool]

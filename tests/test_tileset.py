@@ -14,15 +14,15 @@ from gaussians import pipeline
 from scipy.spatial.transform import Rotation
 from small_splats import extreme_splats, splats
 
+from applications.export import streamed, tiles3d
+from applications.export.formats import Around, format_of
+from applications.export.grouping import groups_of
+from applications.export.levels import GROUP, joined, losses, octree
+from applications.export.merging import areas, footprints, merged
+from applications.export.sog import PROGRAM, run_program
+from gaussian_renderer.camera_paths.without_scene import circle
 from scene.splats.reading import read_splats
 from scene.splats.splats import Splats, opacities, selected
-from splatting.camera_paths.without_scene import circle
-from splatting.exports import streamed, tiles3d
-from splatting.exports.formats import Around, format_of
-from splatting.exports.grouping import groups_of
-from splatting.exports.levels import GROUP, joined, losses, octree
-from splatting.exports.merging import areas, footprints, merged
-from splatting.exports.sog import PROGRAM, run_program
 from utils.system_utils import UserError
 
 

@@ -19,9 +19,9 @@ from arguments import read_stored_options
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
-from splatting.evaluation.training_log import Stopwatch, TrainingLog
-from splatting.training import run
-from splatting.training.iteration import ViewOrder
+from splatting import run
+from splatting.iteration import ViewOrder
+from splatting.records.training_log import Stopwatch, TrainingLog
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -97,7 +97,7 @@ def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
 def test_sh_degree_rises_every_interval_up_to_its_maximum(colmap_scene, tmp_path, monkeypatch):
     degree = 2
     assert run.SH_INTERVAL == 1000
-    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 2)
+    monkeypatch.setattr("splatting.run.SH_INTERVAL", 2)
     every = range(1, 9)
     _train(colmap_scene, tmp_path, "--sh_degree", degree, "--checkpoint_iterations", *every, iterations=8)
     active = [load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][0] for t in every]
@@ -117,7 +117,7 @@ def test_a_training_of_less_than_an_interval_trains_all_sh_bands_in_the_same_sha
 def test_bands_that_were_never_trained_are_told_with_what_leaves_them_out(
     colmap_scene, tmp_path, monkeypatch, capsys, iterations, said
 ):
-    monkeypatch.setattr("splatting.training.run.SH_INTERVAL", 4)
+    monkeypatch.setattr("splatting.run.SH_INTERVAL", 4)
     _train(colmap_scene, tmp_path, iterations=iterations)
     printed = capsys.readouterr().out
     assert said in printed and f"{73 if iterations == 4 else 58} % of it: --prune_sh 0 leaves them out" in printed
@@ -209,7 +209,7 @@ def test_a_damaged_log_is_no_reason_to_stop(tmp_path, capsys, content):
 
 def test_a_stopwatch_stands_still_in_a_pause_and_counts_one_in_another_once(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: now[0])
+    monkeypatch.setattr("splatting.records.training_log.running_seconds", lambda: now[0])
     clock = Stopwatch()
     now[0] += 2
     with pytest.raises(ZeroDivisionError), clock.paused("viewing"):

@@ -32,11 +32,11 @@ from trainings import (
 )
 
 import train
+from groundwork.ranks.ranks import ranks
 from scene.readers.point_cloud import write_point_cloud
-from splatting.distributed.ranks import ranks
+from splatting import log
+from splatting.faster.graphs import Graphs
 from splatting.registry import PARTS, part_class, strategies
-from splatting.training import log
-from splatting.training.steps.graphs import Graphs
 from utils.system_utils import UserError
 
 Result = dict[str, bytes | list]

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 import render as render_script
 import train
+from applications.doctor.model import check_model
 from arguments import ModelParams, read_cfg_args
 from gaussian_renderer import decisive_for, render, trimming
 from gaussian_renderer.free_view import FRACTIONS, NEAREST, WIDER, neighbours, views_between
@@ -27,7 +28,6 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.readers.point_cloud import write_point_cloud
-from splatting.findings.model import check_model
 from utils.system_utils import UserError
 
 ITERATIONS = 12
@@ -37,7 +37,7 @@ BLACK = torch.zeros(3)
 def _train(scene: Path, out: Path, cloud: Path, *more: object) -> None:
     options = ["--eval", "-r", 48, "--iterations", ITERATIONS, "--no_curve", "--init_pcd_path", cloud, *more]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("splatting.training.run.SH_INTERVAL", ITERATIONS)  # no SH band is trained
+        patch.setattr("splatting.run.SH_INTERVAL", ITERATIONS)  # no SH band is trained
         train.main(["-s", str(scene), "-m", str(out), *map(str, options)])
 
 

@@ -4,8 +4,8 @@ import argparse
 
 import numpy as np
 
+from applications.viewer.untrained import untrained
 from arguments import ModelParams
-from splatting.viewer.untrained import untrained
 
 
 def test_points_are_gaussians_of_their_places_and_cameras_have_photos(colmap_scene):

@@ -9,10 +9,10 @@ from pathlib import Path
 import torch
 from gaussians import model, take_steps
 
+from applications.doctor.environment import EXTENSIONS
 from arguments import VERSION
+from groundwork.host.machine import VERSION as WRITTEN
 from scene.gaussians.checkpoint import WRITTEN_BY, save_checkpoint
-from splatting.findings.environment import EXTENSIONS
-from splatting.host.machine import VERSION as WRITTEN
 
 ROOT = Path(__file__).resolve().parents[1]
 NOTES = ROOT / ".ci" / "release_notes.py"

@@ -12,27 +12,27 @@ from gaussians import model, parameters, pipeline
 from scipy.spatial.transform import Rotation
 from synthetic import options_of
 
+from applications.viewer import legend, path_tab, views
+from applications.viewer.coverage import Coverage, Covered
+from applications.viewer.divider import share_at
+from applications.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
+from applications.viewer.page import write_crop
+from applications.viewer.path_tab import PathTab
+from applications.viewer.tabs import FileName
+from applications.viewer.untrained import _spheres
+from applications.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
+from applications.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth
+from gaussian_renderer.camera_paths.keyframes import read_camera_path
+from gaussian_renderer.camera_paths.poses import poses_of
+from gaussian_renderer.camera_paths.start import best_start
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.median_depth import surface_of
 from scene import Scene
 from scene.gaussian_model import GaussianModel
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths.keyframes import read_camera_path
-from splatting.camera_paths.poses import poses_of
-from splatting.camera_paths.start import best_start
-from splatting.viewer import legend, path_tab, views
-from splatting.viewer.coverage import Coverage, Covered
-from splatting.viewer.divider import share_at
-from splatting.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
-from splatting.viewer.page import write_crop
-from splatting.viewer.path_tab import PathTab
-from splatting.viewer.tabs import FileName
-from splatting.viewer.untrained import _spheres
-from splatting.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
-from splatting.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from utils.graphics_utils import camera_center
 from utils.system_utils import UserError
 
@@ -264,7 +264,7 @@ def test_an_image_is_shown_only_where_it_was_taken_and_drawn_once(gaussians, sce
     for change in ({"camera": "no such"}, {"comparison": views.ALONE}):
         assert frames.compared(replace(asked, **change), pose) is None
     calls = []
-    monkeypatch.setattr("splatting.viewer.frames.render", lambda *a, **k: (calls.append(1), render(*a, **k))[1])
+    monkeypatch.setattr("applications.viewer.frames.render", lambda *a, **k: (calls.append(1), render(*a, **k))[1])
     for slider, version in ((0.1, 1), (0.2, 1), (0.9, 1), (0.9, 2)):
         frames.draw(replace(asked, slider=slider), pose, False, version)
     assert len(calls) == 2  # until the model changes

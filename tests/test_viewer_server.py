@@ -20,18 +20,18 @@ from viser_client import Client, get  # noqa: E402
 from waiting import wait_for  # noqa: E402
 from websockets.exceptions import InvalidStatus  # noqa: E402
 
+from applications.viewer import server as servers  # noqa: E402
+from applications.viewer import watchers  # noqa: E402
+from applications.viewer.measure_tab import Place  # noqa: E402
+from applications.viewer.page import Page, answer  # noqa: E402
+from applications.viewer.tabs import first_box  # noqa: E402
+from applications.viewer.untrained import _spheres  # noqa: E402
+from applications.viewer.views import Settings  # noqa: E402
+from gaussian_renderer.camera_paths.start import LEAST, MOST  # noqa: E402
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
+from groundwork.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
 from scene import Scene  # noqa: E402
 from scene.with_splats import model_of  # noqa: E402
-from splatting.camera_paths.start import LEAST, MOST  # noqa: E402
-from splatting.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
-from splatting.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
-from splatting.viewer import server as servers  # noqa: E402
-from splatting.viewer import watchers  # noqa: E402
-from splatting.viewer.measure_tab import Place  # noqa: E402
-from splatting.viewer.page import Page, answer  # noqa: E402
-from splatting.viewer.tabs import first_box  # noqa: E402
-from splatting.viewer.untrained import _spheres  # noqa: E402
-from splatting.viewer.views import Settings  # noqa: E402
 from utils.graphics_utils import camera_center  # noqa: E402
 from utils.system_utils import UserError  # noqa: E402
 

@@ -8,9 +8,9 @@ import pytest
 from gaussians import pipeline
 from room_scene import HALF, HIGH, STEP, cameras, room
 
-from splatting.exports.upright import moved_splats
-from splatting.exports.walking import LEAF, SOLID, Solid, metres_of, octree, solid_of
-from splatting.files.similarity import Similarity
+from applications.export.upright import moved_splats
+from applications.export.walking import LEAF, SOLID, Solid, metres_of, octree, solid_of
+from groundwork.files.similarity import Similarity
 from utils.system_utils import UserError
 
 

@@ -13,14 +13,14 @@ from small_splats import written
 
 import export
 import view
+from applications.export.formats import FORMATS
+from applications.export.reading import read_any
+from applications.viewer.views import SceneCameras
 from gaussian_renderer import render
+from gaussian_renderer.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
 from scene.saved_model import read_model
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
-from splatting.exports.formats import FORMATS
-from splatting.exports.reading import read_any
-from splatting.viewer.views import SceneCameras
 from utils.camera_utils import camera_to_JSON
 from utils.system_utils import UserError
 

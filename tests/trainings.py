@@ -16,11 +16,11 @@ import train
 from scene import sleeping
 from scene.readers.point_cloud import write_point_cloud
 from scene.sleeping import Sleeping
-from splatting.parts import robust_mask_residuals as residuals
-from splatting.parts import sky_shell
-from splatting.training import loop, run
-from splatting.training.iteration import Iteration
-from splatting.training.steps import FasterSteps
+from splatting import loop, run
+from splatting.faster import FasterSteps
+from splatting.features import robust_mask_residuals as residuals
+from splatting.features import sky_shell
+from splatting.iteration import Iteration
 
 Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60

@@ -1,6 +1,6 @@
 """Losses between a render and its target: by fused kernels where they can, in plain PyTorch elsewhere."""
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 import torch.nn.functional as F
 from fused_ssim import FusedSSIMMap, fused_l1_ssim, fused_photometric_loss, has_backend

@@ -23,8 +23,8 @@ from unittest import mock
 import torch
 from torch import library, nn
 
-from splatting.files.plain_files import plain
-from splatting.files.tensor_files import read_tensors
+from groundwork.files.plain_files import plain
+from groundwork.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them

@@ -7,12 +7,12 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from splatting.files.writing import atomic_write, mkdir_p, temporary_folder, writes_files
-from splatting.host import start, torchrun
-from splatting.host.errors import UserError, first_line
-from splatting.host.interrupt import Terminated, let_signals_end
-from splatting.host.machine import compute_device, without_code
-from splatting.host.memory import is_out_of_memory, shortage
+from groundwork.files.writing import atomic_write, mkdir_p, temporary_folder, writes_files
+from groundwork.host import start, torchrun
+from groundwork.host.errors import UserError, first_line
+from groundwork.host.interrupt import Terminated, let_signals_end
+from groundwork.host.machine import compute_device, without_code
+from groundwork.host.memory import is_out_of_memory, shortage
 
 __all__ = [
     "Terminated",
@@ -90,7 +90,7 @@ def _status_of_several(main: Callable[[], object], several: bool) -> int:
         if torchrun.rank() == 0:
             print(f"error: {Path(sys.argv[0]).name} runs in one process; start it without torchrun", file=sys.stderr)
         return 2
-    from splatting.distributed.launcher import run_together  # it loads torch.distributed
+    from groundwork.ranks.launcher import run_together  # it loads torch.distributed
 
     return run_together(main, _outcome)
 

@@ -20,13 +20,13 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from applications.demo.make_scene import make_scene
+from applications.evaluation.child import run_child
 from benchmarks.harness.measuring import add_device, chosen_device
-from splatting.demo.make_scene import make_scene
-from splatting.evaluation.child import run_child
-from splatting.evaluation.model_folder import trained_iterations
-from splatting.evaluation.renders import model_digest
-from splatting.host.listing import markdown_table
-from splatting.host.machine import facts
+from groundwork.host.listing import markdown_table
+from groundwork.host.machine import facts
+from splatting.records.model_folder import trained_iterations
+from splatting.records.renders import model_digest
 from utils.system_utils import UserError, run_cli
 
 _ROOT = Path(__file__).resolve().parents[2]

@@ -29,7 +29,7 @@ from benchmarks.harness.measuring import describe, print_table
 from benchmarks.workloads import textbook
 from benchmarks.workloads.stability_cases import Parameters
 from benchmarks.workloads.stiff_trainings import EXTENT, HEIGHT, KINDS, VIEWS, WIDTH, Cameras, draw, problem
-from splatting.evaluation.figures import save_figure
+from splatting.records.figures import save_figure
 from utils.loss_utils import photometric_loss
 from utils.system_utils import run_cli
 

@@ -14,12 +14,12 @@ import torch
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from benchmarks.harness.measuring import describe, print_table
+from gaussian_renderer.camera_paths.poses import Poses, focus_point, poses_of
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
 from scene.splats.splats import Splats
 from scene.with_splats import model_of, splats_of
-from splatting.camera_paths.poses import Poses, focus_point, poses_of
-from splatting.exports.cleaning import Cleaning, clean
+from splatting.cleaning import Cleaning, clean
 from utils.system_utils import UserError, compute_device, run_cli
 
 _PLACES = (0.25, 0.6)  # of the way from a camera to the point

@@ -16,17 +16,17 @@ import torch
 from scipy.spatial import KDTree
 from torch.nn.functional import grid_sample
 
+from applications.demo.objects import Box, Ground, Sphere, Thing, demo_scene
+from applications.demo.tracer import TARGET, trace
+from applications.export.mesh import CONFIRMED, Mesh, fewer, vertex_normals, volume_of, zero_level
+from applications.export.mesh_cleaning import area_vectors, smooth_rims, whole_parts
+from applications.export.surfaces import Surfaces
+from applications.export.texture import barycentric, owners_of, textured
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from benchmarks.harness.measuring import describe, print_table
 from scene.cameras import Camera
 from scene.saved_model import load_saved
 from scene.with_splats import splats_of
-from splatting.demo.objects import Box, Ground, Sphere, Thing, demo_scene
-from splatting.demo.tracer import TARGET, trace
-from splatting.exports.mesh import CONFIRMED, Mesh, fewer, vertex_normals, volume_of, zero_level
-from splatting.exports.mesh_cleaning import area_vectors, smooth_rims, whole_parts
-from splatting.exports.surfaces import Surfaces
-from splatting.exports.texture import barycentric, owners_of, textured
 from utils.system_utils import compute_device, run_cli
 
 RADIUS = 2.5  # around the point that the cameras face

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from splatting.files.json_files import read_json, write_json
-from splatting.host.machine import instruction_set
+from groundwork.files.json_files import read_json, write_json
+from groundwork.host.machine import instruction_set
 from utils.system_utils import UserError, compute_device
 
 DEVIATIONS = 3  # of single trainings over the stored seeds

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from splatting.demo.make_scene import make_scene
-from splatting.evaluation import stages
-from splatting.evaluation.child import Finished, run_child
-from splatting.evaluation.model_folder import trained_iterations
-from splatting.evaluation.plan import SceneEntry, plan_runs
-from splatting.evaluation.results import MB, read_run
+from applications.demo.make_scene import make_scene
+from applications.evaluation import stages
+from applications.evaluation.child import Finished, run_child
+from applications.evaluation.plan import SceneEntry, plan_runs
+from applications.evaluation.results import MB, read_run
+from splatting.records.model_folder import trained_iterations
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -11,8 +11,8 @@ import torch
 from torch.autograd import DeviceType
 from torch.profiler import ProfilerActivity, profile
 
-from splatting.host.listing import markdown_table
-from splatting.host.machine import facts, one_line
+from groundwork.host.listing import markdown_table
+from groundwork.host.machine import facts, one_line
 from utils.system_utils import UserError, compute_device
 
 

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from splatting.evaluation.error_curve import NAME, read_curve, whole_sets
-from splatting.files.json_files import read_json
+from groundwork.files.json_files import read_json
+from splatting.records.error_curve import NAME, read_curve, whole_sets
 
 
 class Training(NamedTuple):
@@ -59,7 +59,7 @@ def _train(training: Training, gpus: Any) -> dict[str, Any]:
 
     test_psnr: of all test views at the end.
     """
-    import train
+    from splatting.commands import train
 
     if (gpu := gpus.get()) is not None:
         os.environ["CUDA_VISIBLE_DEVICES"] = str(gpu)

@@ -4,22 +4,22 @@ from types import SimpleNamespace
 
 import torch
 
-import train
 from benchmarks.parallel.workload import Workload
+from groundwork.host.interrupt import DeferredInterrupt
+from groundwork.ranks.ranks import ranks
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
 from scene.in_view import share_in_view
 from scene.sleeping import Sleeping
-from splatting.distributed.ranks import ranks
-from splatting.evaluation.training_log import Stopwatch
-from splatting.host.interrupt import DeferredInterrupt
-from splatting.parts.spill import sentences
+from splatting.commands import train
+from splatting.features.spill import sentences
+from splatting.iteration import ViewOrder
+from splatting.objective import LossWatch, Objective
+from splatting.records.training_log import Stopwatch
 from splatting.registry import part_class, strategy_part
-from splatting.training.iteration import ViewOrder
-from splatting.training.objective import LossWatch, Objective
-from splatting.training.run import Run
-from splatting.training.schedule import Schedule
-from splatting.training.watch import DivergenceWatch
+from splatting.run import Run
+from splatting.schedule import Schedule
+from splatting.watch import DivergenceWatch
 from utils.system_utils import compute_device
 
 _EXTENT = 5.0  # world units

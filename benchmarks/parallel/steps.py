@@ -34,13 +34,13 @@ import torch
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.parallel.run import WorkloadRun
 from benchmarks.parallel.workload import ALL
+from groundwork.host.memory import peak_memory_mib
+from groundwork.ranks.ranks import ranks
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import bytes_of
-from splatting.distributed.ranks import ranks
-from splatting.host.memory import peak_memory_mib
+from splatting.iteration import Iteration
+from splatting.loop import run_training
 from splatting.part import Part
-from splatting.training.iteration import Iteration
-from splatting.training.loop import run_training
 from utils.system_utils import UserError, compute_device, run_cli
 
 ROOT = Path(__file__).resolve().parents[2]

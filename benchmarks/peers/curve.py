@@ -15,7 +15,7 @@ from tqdm import tqdm
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved, read_model
-from splatting.evaluation.error_curve import read_peer, write_peer
+from splatting.records.error_curve import read_peer, write_peer
 from utils.system_utils import UserError, compute_device, run_cli, saved_ply
 
 SECONDS, CURVE = "seconds.csv", "peer.csv"

@@ -19,8 +19,8 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean
 
-from splatting.evaluation.error_curve import PEER_REQUIRED, read_peer
-from splatting.evaluation.figures import save_figure
+from splatting.records.error_curve import PEER_REQUIRED, read_peer
+from splatting.records.figures import save_figure
 from utils.system_utils import UserError, run_cli
 
 OURS, PEERS = ("#0072B2", "#009E73", "#CC79A7"), "0.25"  # Okabe and Ito's colours

@@ -27,8 +27,8 @@ from benchmarks.peers.time_to_target import (
     reached,
     times,
 )
-from splatting.evaluation.error_curve import NAME, read_peer
-from splatting.evaluation.figures import save_figure
+from splatting.records.error_curve import NAME, read_peer
+from splatting.records.figures import save_figure
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 LINES = ("-", "--", ":")  # with ten colours for thirty programs

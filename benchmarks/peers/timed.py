@@ -18,7 +18,7 @@ from benchmarks.harness.measuring import describe
 from benchmarks.peers.curve import SECONDS
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
-from splatting.evaluation.error_curve import Row, write_peer
+from splatting.records.error_curve import Row, write_peer
 from utils.system_utils import UserError, compute_device, mkdir_p, saved_ply
 
 DEGREE = 3  # of SH

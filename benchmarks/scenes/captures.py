@@ -20,8 +20,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import ExifTags, Image
 
+from applications.demo.make_scene import write_scene
 from benchmarks.scenes.traced import TRACED
-from splatting.demo.make_scene import write_scene
 from utils.system_utils import UserError, mkdir_p, run_cli
 
 if TYPE_CHECKING:

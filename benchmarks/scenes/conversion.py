@@ -30,8 +30,8 @@ from PIL import Image
 
 from benchmarks.harness.measuring import describe, print_table
 from benchmarks.scenes.captures import make, restricted
-from splatting.evaluation.figures import save_figure
-from splatting.evaluation.model_folder import curve_of
+from splatting.records.figures import save_figure
+from splatting.records.model_folder import curve_of
 from utils.system_utils import UserError, run_cli
 
 if TYPE_CHECKING:

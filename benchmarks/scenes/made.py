@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from applications.demo.make_scene import make_scene
+from applications.demo.objects import Box, Sphere, Thing, backdrop_texture, demo_scene, marble
 from scene.readers.info import HOLD
-from splatting.demo.make_scene import make_scene
-from splatting.demo.objects import Box, Sphere, Thing, backdrop_texture, demo_scene, marble
 from utils.system_utils import UserError, run_cli
 
 _VIEWS, _POINTS, _SIZE = 48, 8000, (240, 180)

@@ -26,11 +26,11 @@ NOTHING = "nothing"
 OMISSIONS = {  # what is left in, and by which words and changes
     NOTHING: Training(()),
     "rows that sleep": Training((), {"scene.sleeping:MOST_SHARE": 0.0}),
-    "SH bands before their turn": Training((), {"splatting.training.run:Run._raises_degree": _all_bands_at_once}),
+    "SH bands before their turn": Training((), {"splatting.run:Run._raises_degree": _all_bands_at_once}),
     "Gaussians unseen at the end": Training(("--keep_unseen",)),
     # With --time_budget alone.
     "large photos of a short training": Training(
-        (), {"splatting.parts.time_budget_schedule:PYRAMID": ((0.0, 1.0), (0.1, 1.0))}
+        (), {"splatting.features.time_budget_schedule:PYRAMID": ((0.0, 1.0), (0.1, 1.0))}
     ),
 }
 COLUMNS = {  # heading: key of a record, digits

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatting.demo.objects import Box, Sphere, Thing, demo_scene, marble
-from splatting.demo.tracer import TARGET, View, look_at
+from applications.demo.objects import Box, Sphere, Thing, demo_scene, marble
+from applications.demo.tracer import TARGET, View, look_at
 
 _DOOR, _DOORS, _WIDE, _HIGH = 2.0, 24, 1.2, 2.5  # of the corridor, in units; from the middle to a wall
 _APART = 100.0  # from one room with the poster to the other
@@ -65,7 +65,7 @@ class Hollow(NamedTuple):
     boxes: tuple[Box, ...]
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Distances (R,) at which rays leave the last box; as `splatting.demo.objects` has it."""
+        """Distances (R,) at which rays leave the last box; as `applications.demo.objects` has it."""
         end = np.zeros(direction.shape[1], np.float32)
         for box in self.boxes * len(self.boxes):
             leave = box.intersect(origin + end * direction, direction)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gaussian_renderer.over_ranks.bands import Bands, find_bands, tile_rows
 from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_splats
-from splatting.distributed.ranks import Ranks
+from groundwork.ranks.ranks import Ranks
 
 
 class Band(NamedTuple):

@@ -10,7 +10,7 @@ from diff_gaussian_rasterization.fakes import TILE
 from fused_ssim import REACH
 from torch import Tensor
 
-from splatting.distributed.ranks import Ranks
+from groundwork.ranks.ranks import Ranks
 
 # Work in units of a rectangle's width in a row: of an instance that the backward reads, and of a tile besides. On
 # one GPU a width, with 3.43 to a splat of 2.94 instances, takes 0.02 to 0.045 us, an instance 0.38 us and its row about

@@ -12,8 +12,8 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.bands import Bands
-from splatting.distributed.ranks import Ranks
-from splatting.host.read_later import read_later
+from groundwork.host.read_later import read_later
+from groundwork.ranks.ranks import Ranks
 
 # Records for a rank are a multiple of it, so that messages of words begin at a multiple of 16 bytes: else NCCL takes
 # longer.

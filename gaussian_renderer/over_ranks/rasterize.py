@@ -13,7 +13,7 @@ from diff_gaussian_rasterization.scene import Scene, scene_arguments
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.band import camera_gradient, draw_view, gradient_rows, whole_image
-from splatting.distributed.ranks import Ranks
+from groundwork.ranks.ranks import Ranks
 
 
 def rasterize_over(

@@ -20,9 +20,9 @@ from gaussian_renderer.over_ranks.band import (
 )
 from gaussian_renderer.over_ranks.bands import KnownBands as KnownBands
 from gaussian_renderer.over_ranks.rasterize import rasterize_over
+from groundwork.ranks.ranks import ALONE, Ranks
 from scene.cameras import Camera, MiniCam
 from scene.fused_adam import FusedAdam
-from splatting.distributed.ranks import ALONE, Ranks
 
 _ONLY_COLORS = [name == "colors" for name in GRADIENTS]
 

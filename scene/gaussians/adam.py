@@ -7,7 +7,7 @@ from operator import itemgetter
 from types import FunctionType
 from typing import Any
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.optim import adam_, sparse_adam_
 from torch import Tensor

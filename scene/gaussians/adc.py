@@ -6,11 +6,11 @@ Functions of a GaussianModel, which has them as its methods.
 import torch
 from torch import Tensor
 
+from groundwork.ranks.rows import changes_rows
 from scene.gaussians import density_rules as rules
 from scene.gaussians.attributes import Rows
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import PER_ROW
-from splatting.distributed.rows import changes_rows
 from utils.system_utils import UserError
 
 _STANDARD = ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation")  # the order of densification_postfix

@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from groundwork.files.tensor_files import read_tensors
+from groundwork.host.machine import VERSION
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.attributes import IN_CHECKPOINT, Attribute, Rows
 from scene.gaussians.exposure import Exposures
 from scene.gaussians.finite import check_finite, with_scales
 from scene.gaussians.parameters import GaussianParameters
 from scene.gaussians.statistics import NAMES, Statistics
-from splatting.files.tensor_files import read_tensors
-from splatting.host.machine import VERSION
 from utils.system_utils import UserError, atomic_write, writes_files
 
 _LARGEST = 1e15  # extent; learning rates are multiples of it

@@ -8,13 +8,13 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.density import split_positions
 from torch import Tensor
 
-from splatting.deterministic.counter_rng import Stream
-from splatting.distributed.rows import WHOLE, Shards
+from groundwork.deterministic.counter_rng import Stream
+from groundwork.ranks.rows import WHOLE, Shards
 
 SHRINK = 0.8  # N children of a split have 1 / (0.8 N) of the parent's scale: 1 / 1.6 for two (paper, section 5.2)
 PRUNE_EXTENT = 0.1  # a Gaussian wider than this part of the scene's extent is removed, once sizes are limited

@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from groundwork.files.plain_files import plain_text
+from groundwork.host.machine import compute_device
 from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.table import trainable
-from splatting.files.plain_files import plain_text
-from splatting.host.machine import compute_device
 from utils.general_utils import get_expon_lr_func
 from utils.system_utils import UserError, atomic_write
 

@@ -6,8 +6,8 @@ import sys
 import torch
 from torch import Tensor
 
+from groundwork.ranks.rows import WHOLE, Shards
 from scene.gaussians.attributes import Rows
-from splatting.distributed.rows import WHOLE, Shards
 from utils.system_utils import UserError
 
 SMALLEST = -80.0  # exp(-80) is 1.8e-35, which float32 still holds with all its digits

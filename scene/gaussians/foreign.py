@@ -8,10 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from groundwork.deterministic.portable_math import exp, log
+from groundwork.files.ply_header import header_lines
+from groundwork.files.unread import say_once, say_unread
 from scene.gaussians.attributes import Rows
-from splatting.deterministic.portable_math import exp, log
-from splatting.files.ply_header import header_lines
-from splatting.files.unread import say_once, say_unread
 
 _FILTER = "filter_3D"  # the width of a Gaussian's filter, which Mip-Splatting and what follows it leave to the renderer
 _MOVING = ("trbf_", "motion_", "omega_")  # beginnings of columns: Gaussians that come, go and move

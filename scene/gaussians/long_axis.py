@@ -21,8 +21,8 @@ import math
 import torch
 from torch import Tensor
 
+from groundwork.deterministic.portable_math import exp, log
 from scene.gaussians.attributes import Rows
-from splatting.deterministic.portable_math import exp, log
 
 SHIFT = math.sqrt(0.5)
 SHRINK = math.sqrt(1.0 - SHIFT * SHIFT)

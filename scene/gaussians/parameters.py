@@ -11,15 +11,15 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from groundwork.host.machine import compute_device
+from groundwork.ranks.ranks import Ranks
+from groundwork.ranks.rows import WHOLE, Divided, Shards
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, frame_comments, read_ply, row_bytes, write_ply
 from scene.gaussians.spilled import Room, empty_for, is_spilled, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
-from splatting.distributed.ranks import Ranks
-from splatting.distributed.rows import WHOLE, Divided, Shards
-from splatting.host.machine import compute_device
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
 from utils.system_utils import UserError
 

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.density import penalise_
 

@@ -12,11 +12,11 @@ from numpy.lib.recfunctions import rename_fields, repack_fields
 from plyfile import PlyParseError
 from torch import Tensor
 
+from groundwork.files.ply_header import read_elements
+from groundwork.ranks.rows import WHOLE, Shards
 from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussians.finite import with_scales
 from scene.gaussians.foreign import as_others_mean
-from splatting.distributed.rows import WHOLE, Shards
-from splatting.files.ply_header import read_elements
 from utils.system_utils import UserError, atomic_write, writes_files
 
 FLAT = "flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"

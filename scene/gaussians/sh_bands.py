@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from splatting.distributed.rows import PIECE, WHOLE, Shards
+from groundwork.ranks.rows import PIECE, WHOLE, Shards
 
 SH_INTERVAL = 1000  # iterations between raises of the active SH degree; shorter trainings raise it sooner
 

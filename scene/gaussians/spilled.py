@@ -7,12 +7,12 @@ CPU there are none.
 
 from typing import Any
 
-import splatting.host.extensions  # noqa: F401  isort: skip  (before the extensions)
+import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
 from torch import Tensor
 
-from splatting.distributed.rows import PIECE
+from groundwork.ranks.rows import PIECE
 
 
 class Room:

@@ -6,10 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from groundwork.host.memory import is_out_of_memory
 from scene.gaussians.attributes import Rows
 from scene.gaussians.spilled import empty_for, empty_spilled_as, placed
 from scene.gaussians.statistics import PER_ROW
-from splatting.host.memory import is_out_of_memory
 
 Group = dict[str, Any]  # a parameter group of a torch optimiser: `params`, options, and maybe `name`
 States = MutableMapping[Tensor, dict[str, Any]]  # an optimiser's state by parameter

@@ -10,10 +10,10 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from splatting.files.color_profiles import has_other_colors, in_srgb
-from splatting.files.image_files import MOST_PIXELS, UNREADABLE, eight_bits, open_image, sixteen_bits
-from splatting.files.plain_files import not_the_file
-from splatting.host.listing import some
+from groundwork.files.color_profiles import has_other_colors, in_srgb
+from groundwork.files.image_files import MOST_PIXELS, UNREADABLE, eight_bits, open_image, sixteen_bits
+from groundwork.files.plain_files import not_the_file
+from groundwork.host.listing import some
 from utils.system_utils import UserError
 
 _TAIL = 4096

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import ExifTags
 
-from splatting.files.image_files import UNREADABLE, open_image
+from groundwork.files.image_files import UNREADABLE, open_image
 
 _APPLE = b"Apple iOS\0"
 _ACCELERATION = 8  # tag of Apple's notes: three signed rationals (ExifTool, "Apple Tags", AccelerationVector)

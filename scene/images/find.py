@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
+from groundwork.files.image_files import SUFFIXES
+from groundwork.host.listing import some
 from scene.images.decode import picture_size
-from splatting.files.image_files import SUFFIXES
-from splatting.host.listing import some
 from utils.system_utils import UserError
 
 

@@ -18,10 +18,10 @@ import torch
 from PIL import Image, ImageFilter
 from torch import Tensor
 
+from groundwork.files.image_files import SUFFIXES
+from groundwork.host.listing import some
 from scene.images.decode import decode, grey_values, may_be_transparent, picture_size
 from scene.images.find import SideFiles
-from splatting.files.image_files import SUFFIXES
-from splatting.host.listing import some
 from utils.system_utils import UserError
 
 AUTO = "auto"

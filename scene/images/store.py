@@ -12,11 +12,11 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from groundwork.host.machine import threads
+from groundwork.host.memory import free_memory
+from groundwork.ranks.ranks import ALONE, Ranks
+from groundwork.ranks.shared_images import SharedImage, divided
 from scene.images.decode import decode
-from splatting.distributed.ranks import ALONE, Ranks
-from splatting.distributed.shared_images import SharedImage, divided
-from splatting.host.machine import threads
-from splatting.host.memory import free_memory
 
 GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
 COPIES_AHEAD = 2  # images copied to the GPU ahead of their use; a copy takes less than an iteration

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from groundwork.files.unread import say_unread
 from scene.colmap_loader import Camera, Image, Points, qvec2rotmat, read_cameras, read_images, read_points
 from scene.images.find import find_images
 from scene.images.lens import Lens
@@ -18,7 +19,6 @@ from scene.readers.photos import camera_info, finished
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.scene_folder import REPORT
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
-from splatting.files.unread import say_unread
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 

@@ -18,15 +18,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from groundwork.files.image_files import UNREADABLE, open_image, plane_scale
+from groundwork.files.plain_files import plain, plain_text
+from groundwork.host.listing import some
+from groundwork.host.machine import threads
 from scene.images.decode import picture_size
 from scene.images.find import SideFiles, files_below
 from scene.readers.colmap import find_model
 from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.photos import undistorted_folder
-from splatting.files.image_files import UNREADABLE, open_image, plane_scale
-from splatting.files.plain_files import plain, plain_text
-from splatting.host.listing import some
-from splatting.host.machine import threads
 from utils.system_utils import UserError
 
 PARAMS = "depth_params.json"

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from diff_gaussian_rasterization.lens import MODELS
 
+from groundwork.host.progress import Bar
 from scene.colmap_loader import Camera, Image, Points, qvec2rotmat
 from scene.images.find import SideFiles
 from scene.readers.colmap import AGAIN, ColmapModel, find_model, read_model_of_kind
 from scene.readers.depth_maps import METRIC, PARAMS, SCALE, STEP, Metric, inverses, map_names, read_values, sample
 from scene.readers.info import SceneInfo
 from scene.readers.tracks import projected
-from splatting.host.progress import Bar
 from utils.system_utils import UserError, atomic_write
 
 _WITH_POINTS = "export the model with the 2D points of its photos, or train without depth maps"

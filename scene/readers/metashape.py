@@ -17,12 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from groundwork.files.image_files import SUFFIXES
+from groundwork.files.plain_files import MOST, plain
+from groundwork.files.unread import say_unread
+from groundwork.host.listing import some
 from scene.images.find import FileIndex
 from scene.images.lens import PANORAMA
-from splatting.files.image_files import SUFFIXES
-from splatting.files.plain_files import MOST, plain
-from splatting.files.unread import say_unread
-from splatting.host.listing import some
 from utils.system_utils import UserError
 
 _HEAD = 1024  # bytes in which the file says what it is

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from groundwork.files.image_files import SUFFIXES
+from groundwork.files.json_files import read_json
 from scene.colmap_loader import qvec2rotmat
-from splatting.files.image_files import SUFFIXES
-from splatting.files.json_files import read_json
 from utils.system_utils import UserError
 
 # Photos and cameras of Polycam: corrected ones are undistorted, and their poses optimized over the whole capture.

@@ -18,6 +18,12 @@ from diff_gaussian_rasterization.lens import MODELS, lens_of
 from PIL import ExifTags, Image
 from PIL.PngImagePlugin import PngInfo
 
+from groundwork.files.color_tags import mark_srgb
+from groundwork.files.folders import cache_folder, remove_temporary_files
+from groundwork.files.image_files import UNREADABLE, open_image
+from groundwork.files.plain_files import plain
+from groundwork.host.listing import some
+from groundwork.host.progress import in_threads
 from scene.images.decode import decode, picture_size, picture_sizes
 from scene.images.lens import (
     PANORAMA,
@@ -31,12 +37,6 @@ from scene.images.lens import (
 )
 from scene.images.masks import TRANSPARENT, Mask
 from scene.readers.info import CameraInfo, are_exchanged, exchanged_sides
-from splatting.files.color_tags import mark_srgb
-from splatting.files.folders import cache_folder, remove_temporary_files
-from splatting.files.image_files import UNREADABLE, open_image
-from splatting.files.plain_files import plain
-from splatting.host.listing import some
-from splatting.host.progress import in_threads
 from utils.system_utils import UserError, atomic_write, mkdir_p
 
 FARTHEST = 1e12  # from the origin, beyond which lie damaged files; there a double has steps of 1e-4

@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from splatting.files.plain_files import check_packed_rows, encoding_of
-from splatting.files.ply_header import read_elements
+from groundwork.files.plain_files import check_packed_rows, encoding_of
+from groundwork.files.ply_header import read_elements
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import SH2RGB
 from utils.system_utils import UserError, atomic_write

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
+from groundwork.files.image_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from groundwork.host.listing import some
+from groundwork.host.start import typed_command
 from scene.readers.metashape import cameras_xml
 from scene.readers.phone_scans import polycam_capture, record3d_capture
-from splatting.files.image_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES
-from splatting.host.listing import some
-from splatting.host.start import typed_command
 from utils.system_utils import UserError
 
 COLMAP, BLENDER, NERFSTUDIO = "Colmap", "Blender", "Nerfstudio"

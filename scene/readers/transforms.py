@@ -13,6 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from groundwork.files.image_files import SUFFIXES
+from groundwork.files.json_files import read_json
+from groundwork.files.unread import say_unread
+from groundwork.host.listing import some
 from scene.images.decode import picture_sizes
 from scene.images.find import FileIndex, find_images, find_in, find_listed, identity, other_folder
 from scene.images.lens import Lens
@@ -33,10 +37,6 @@ from scene.readers.start_cloud import (
     scene_info,
 )
 from scene.readers.transforms_lens import FIELDS, circle_of, lens_of
-from splatting.files.image_files import SUFFIXES
-from splatting.files.json_files import read_json
-from splatting.files.unread import say_unread
-from splatting.host.listing import some
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
 

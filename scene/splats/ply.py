@@ -22,13 +22,13 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
+from groundwork.files.json_files import LARGEST_OFFSET
+from groundwork.files.ply_header import header_lines, read_elements
+from groundwork.files.unread import say_unread
 from scene.gaussians.ply import frame_comments, read_ply, read_vertices, write_ply
 from scene.readers.info import origin_near
 from scene.splats.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
 from scene.splats.splats import Splats, base_colors, logits, opacities, selected
-from splatting.files.json_files import LARGEST_OFFSET
-from splatting.files.ply_header import header_lines, read_elements
-from splatting.files.unread import say_unread
 from utils.sh_utils import C0
 from utils.system_utils import UserError, atomic_write
 

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
+from groundwork.files.ply_header import header_lines
 from scene.splats.dot_splat import read_splat
 from scene.splats.ply import read_compressed_ply, read_plain_ply
 from scene.splats.splats import Splats, tidy
 from scene.splats.spz import read_spz
 from scene.splats.trained import read_trained
-from splatting.files.ply_header import header_lines
 from utils.system_utils import UserError
 
 READABLE = "PLY, compressed PLY, SPZ, .splat, or a checkpoint"

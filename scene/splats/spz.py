@@ -24,10 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from groundwork.files.plain_files import check_packed_rows
+from groundwork.files.unread import say_unread
 from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
 from scene.splats.splats import Splats, from_axes, half_rotated, logits, opacities, selected
-from splatting.files.plain_files import check_packed_rows
-from splatting.files.unread import say_unread
 from utils.system_utils import UserError, atomic_write
 
 MAGIC = 0x5053474E

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from groundwork.files.tensor_files import read_tensors
+from groundwork.files.unread import say_once
 from scene.splats.splats import Splats
-from splatting.files.tensor_files import read_tensors
-from splatting.files.unread import say_once
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
 

@@ -14,11 +14,11 @@ from room_scene import cameras as in_room
 from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
 from test_html_export import Page as HtmlPage
 
+from applications.export.html import write_html
+from applications.export.walking import EYES, solid_of
+from gaussian_renderer.camera_paths.poses import poses_of
+from gaussian_renderer.camera_paths.start import narrowed
 from gaussian_renderer.free_view import free_view
-from splatting.camera_paths.poses import poses_of
-from splatting.camera_paths.start import narrowed
-from splatting.exports.html import write_html
-from splatting.exports.walking import EYES, solid_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Frame, Page

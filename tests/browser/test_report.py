@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from report_runs import set_runs
 
-from splatting.evaluation.report import make_report, write_report
+from applications.evaluation.report import make_report, write_report
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

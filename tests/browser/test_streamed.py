@@ -14,10 +14,10 @@ from html_scene import SIZE, balls, cameras
 from served_page import serving_folder
 from tab_pictures import settled
 
-from splatting.exports import html, streamed
-from splatting.exports.formats import Around
-from splatting.exports.levels import octree
-from splatting.exports.sog import PROGRAM
+from applications.export import html, streamed
+from applications.export.formats import Around
+from applications.export.levels import octree
+from applications.export.sog import PROGRAM
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -15,11 +15,11 @@ from html_scene import FOV, SIZE, balls, cameras
 from served_page import serving_folder
 from tab_pictures import BACKGROUND, expected, psnr, settled
 
+from applications.export import tiles3d
+from applications.export.formats import Around, format_of
+from applications.export.levels import Tile, joined, octree
+from gaussian_renderer.camera_paths.poses import poses_of
 from scene.splats.splats import Splats
-from splatting.camera_paths.poses import poses_of
-from splatting.exports import tiles3d
-from splatting.exports.formats import Around, format_of
-from splatting.exports.levels import Tile, joined, octree
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -11,10 +11,10 @@ from pathlib import Path
 from synthetic import make_blender_scene
 
 import train
+from applications.evaluation.configs import read_configs
 from arguments import ModelParams, OptimizationParams, PipelineParams, read_cfg_args, read_model_json
 from arguments.launch import add_launch_options
 from fuzz.damage import changed, damaged
-from splatting.evaluation.configs import read_configs
 
 _WORDS = (
     *("-1", "0", "1", "2", "3", "7", "0.5", "-0.1", "1e-9", "1e9", "nan", "inf", "-inf", "1e400", "9" * 30, "x", ""),

@@ -13,8 +13,8 @@ from gaussians import model, take_steps
 
 from fuzz.crafted_pickles import CRAFTED, SECRET, archive
 from fuzz.damage import damaged
+from groundwork.files.tensor_files import read_tensors
 from scene.gaussians.checkpoint import load_checkpoint
-from splatting.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 _PLAIN = (type(None), bool, int, float, str, torch.Tensor, torch.nn.Parameter)

@@ -14,7 +14,7 @@ import time
 import traceback
 from pathlib import Path
 
-import splatting.host.openmp  # noqa: F401  isort: skip  (before torch)
+import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import torch
 
 import train

@@ -15,22 +15,22 @@ from strategies import begun
 
 import train
 from gaussian_renderer import model_inputs, rasterizer_settings
+from groundwork.deterministic.counter_rng import Stream
+from groundwork.ranks.rows import WHOLE
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adc import remove_useless
 from scene.gaussians.density_rules import band_rate, default_budget
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
-from splatting.deterministic.counter_rng import Stream
-from splatting.distributed.rows import WHOLE
-from splatting.findings.training import another_number
+from splatting.checks import another_number
+from splatting.features.budget import Budget
+from splatting.features.budget_rules import error_scores, fade, split_in_two
+from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule
+from splatting.objective import Objective
 from splatting.part import Strategy
-from splatting.parts.budget import Budget
-from splatting.parts.budget_rules import error_scores, fade, split_in_two
-from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule
 from splatting.registry import part_class
-from splatting.training.objective import Objective
-from splatting.training.schedule import STEADY, Schedule
+from splatting.schedule import STEADY, Schedule
 from utils.graphics_utils import getProjectionMatrix
 from utils.system_utils import UserError
 

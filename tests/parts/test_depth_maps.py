@@ -18,6 +18,7 @@ from synthetic import FakeGaussians, options_of
 
 import train
 from gaussian_renderer import render
+from groundwork.files.image_files import write_plane
 from scene import Scene, colmap_loader
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
@@ -35,8 +36,7 @@ from scene.readers.depth_maps import (
 )
 from scene.readers.depth_scale import fit_image, fit_line, make_depth_params, sightings
 from scene.readers.info import CameraInfo, SceneInfo
-from splatting.files.image_files import write_plane
-from splatting.parts.depths import depth_loss
+from splatting.features.depths import depth_loss
 from utils import make_depth_scale
 from utils.loss_utils import inverse_depth_loss
 from utils.system_utils import UserError

@@ -19,8 +19,8 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import EXPOSURES, WRITTEN_BY, extra_state, load_checkpoint, save_checkpoint
 from scene.gaussians.exposure import Exposures, read_exposures
 from scene.readers.info import exposure_names
-from splatting.evaluation.error_curve import read_curve
-from splatting.parts.exposure import train_on_all
+from splatting.features.exposure import train_on_all
+from splatting.records.error_curve import read_curve
 from splatting.registry import states_in
 from utils.general_utils import get_expon_lr_func
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim

@@ -14,8 +14,8 @@ from trainings import MCMC, narrow_scene, train_on
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint
 from scene.saved_model import read_model
-from splatting.parts.mcmc_rules import MOST_PARTS, divided, draw, grow, relocate
-from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule
+from splatting.features.mcmc_rules import MOST_PARTS, divided, draw, grow, relocate
+from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule
 from utils.system_utils import UserError
 
 

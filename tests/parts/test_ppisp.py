@@ -17,15 +17,15 @@ from trainings import train_on, trained
 
 import metrics
 import render
+from applications.evaluation.plan import Run, SceneEntry
+from applications.evaluation.results import read_run
 from gaussian_renderer.scored_views import shown_as_trained
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import Track
 from scene.saved_model import load_saved
 from scene.scene import Scene
-from splatting.evaluation.plan import Run, SceneEntry
-from splatting.evaluation.results import read_run
-from splatting.parts.ppisp import exposures
-from splatting.parts.ppisp_appearance import NAME, PhotoAppearance, appearance_of, read_appearance
+from splatting.features.ppisp import exposures
+from splatting.features.ppisp_appearance import NAME, PhotoAppearance, appearance_of, read_appearance
 from utils.system_utils import UserError
 
 SIDE = 20

@@ -16,6 +16,11 @@ from trainings import plain_training, shared_scene, train_on, trained
 
 import metrics
 import render
+from applications.demo.make_scene import write_scene
+from applications.demo.objects import demo_scene
+from applications.demo.tracer import FISHEYE, ring_views
+from applications.evaluation.plan import Run, SceneEntry
+from applications.evaluation.results import read_run
 from benchmarks.scenes.poses import disturbed
 from scene.dataset_readers import SceneInfo
 from scene.gaussian_model import GaussianModel
@@ -24,14 +29,9 @@ from scene.readers.colmap import read_colmap
 from scene.readers.tracks import Track, rays_to, read_tracks
 from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
 from scene.scene import Scene
-from splatting.demo.make_scene import write_scene
-from splatting.demo.objects import demo_scene
-from splatting.demo.tracer import FISHEYE, ring_views
-from splatting.evaluation.plan import Run, SceneEntry
-from splatting.evaluation.results import read_run
-from splatting.parts import refine_poses_steps as refinement
-from splatting.parts.refine_poses import NAME, with_poses
-from splatting.parts.refine_poses_steps import BoundedAdam, PoseRefinement
+from splatting.features import refine_poses_steps as refinement
+from splatting.features.refine_poses import NAME, with_poses
+from splatting.features.refine_poses_steps import BoundedAdam, PoseRefinement
 from utils.graphics_utils import camera_center, world_to_camera
 from utils.system_utils import UserError
 

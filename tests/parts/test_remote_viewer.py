@@ -24,8 +24,8 @@ from arguments.launch import launch_options
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
+from splatting.features.remote_viewer import RemoteViewer
 from splatting.part import Options, Part
-from splatting.parts.remote_viewer import RemoteViewer
 
 ITERATIONS = 60
 OPTIONS = (), ("--train_test_exp", "--antialiasing", "-w", "--random_background", "--convert_SHs_python")

@@ -9,11 +9,11 @@ import pytest
 from trainings import train_on
 
 from arguments.launch import launch_options
+from groundwork.files.json_files import read_model_json
 from scene.gaussians.checkpoint import load_checkpoint
-from splatting.files.json_files import read_model_json
-from splatting.parts import resume
-from splatting.parts.resume import finished
-from splatting.training.folder import REPLACED, new_folder
+from splatting.features import resume
+from splatting.features.resume import finished
+from splatting.folder import REPLACED, new_folder
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1)

@@ -11,10 +11,10 @@ from scipy import ndimage
 from synthetic import make_colmap_scene
 from trainings import trained
 
-from splatting.evaluation.renders import GAP, HEADER
-from splatting.evaluation.training_log import read_log
-from splatting.parts import robust_mask_residuals as residuals
-from splatting.parts.robust_mask_residuals import Residuals
+from splatting.features import robust_mask_residuals as residuals
+from splatting.features.robust_mask_residuals import Residuals
+from splatting.records.renders import GAP, HEADER
+from splatting.records.training_log import read_log
 from utils.system_utils import UserError
 
 ON = "--robust_mask", 0.3, "--test_iterations", -1, "--opacity_reset_interval", 3000

@@ -13,18 +13,18 @@ from trainings import trained
 
 import export
 import train
+from applications.demo.make_scene import Things, write_scene
+from applications.demo.objects import Box, Thing, demo_scene
+from applications.demo.tracer import ring_views, shade, trace
 from benchmarks.scenes.made import with_sky
+from groundwork.files.json_files import read_model_json
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import projected
 from scene.scene import Scene
 from scene.splats.reading import read_splats
-from splatting.demo.make_scene import Things, write_scene
-from splatting.demo.objects import Box, Thing, demo_scene
-from splatting.demo.tracer import ring_views, shade, trace
-from splatting.files.json_files import read_model_json
-from splatting.parts.sky_shell import FEWEST, Shell, find_sky
-from splatting.parts.time_budget_file import write_schedule
-from splatting.parts.time_budget_schedule import Block, Decided
+from splatting.features.sky_shell import FEWEST, Shell, find_sky
+from splatting.features.time_budget_file import write_schedule
+from splatting.features.time_budget_schedule import Block, Decided
 from utils.system_utils import UserError
 
 ON = "--sky", "auto", "--densify_grad_threshold", 1e-5

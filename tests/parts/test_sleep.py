@@ -35,18 +35,18 @@ from trainings import (
 )
 
 import train
+from groundwork.ranks.ranks import ranks
 from scene import sleeping
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
 from scene.sleeping import BLOCK, REST
-from splatting.distributed.ranks import ranks
-from splatting.training import run as runs
-from splatting.training.iteration import Iteration
-from splatting.training.log import ProgressBar
-from splatting.training.objective import Objective
-from splatting.training.steps import captured
+from splatting import run as runs
+from splatting.faster import captured
+from splatting.iteration import Iteration
+from splatting.log import ProgressBar
+from splatting.objective import Objective
 from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15

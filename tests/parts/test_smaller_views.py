@@ -19,8 +19,8 @@ from scene.gaussian_model import GaussianModel
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo
-from splatting.parts.time_budget import Sizes, smaller
-from splatting.parts.time_budget_schedule import PYRAMID, Block, Decided, DecidedSchedule
+from splatting.features.time_budget import Sizes, smaller
+from splatting.features.time_budget_schedule import PYRAMID, Block, Decided, DecidedSchedule
 
 
 def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianModel]:

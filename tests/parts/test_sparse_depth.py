@@ -12,12 +12,12 @@ from trainings import trained
 
 import metrics
 import render
+from groundwork.files.image_files import read_plane
+from groundwork.files.json_files import read_json
 from scene.gaussian_model import GaussianModel
 from scene.point_depths import HELD_OUT, PointDepths, points_of
 from scene.readers.tracks import read_tracks
 from scene.scene import Scene
-from splatting.files.image_files import read_plane
-from splatting.files.json_files import read_json
 
 FISHEYE = (*BROWN[:4], 0.02, -0.01, 0.003, 0.001)
 

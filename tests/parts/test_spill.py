@@ -26,18 +26,17 @@ from trainings import (
     with_clusters,
 )
 
+from groundwork.ranks.ranks import ranks
 from scene import sleeping
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
-from splatting.distributed.ranks import ranks
-from splatting.findings import resources
-from splatting.findings.resources import training_bytes
-from splatting.parts import spill as spill_part
-from splatting.parts import spill_memory as gpu_memory
-from splatting.parts.spill import sentences
-from splatting.parts.spill_memory import GpuMemory, resident_rows, spillable_bytes
+from splatting import resources, run
+from splatting.features import spill as spill_part
+from splatting.features import spill_memory as gpu_memory
+from splatting.features.spill import sentences
+from splatting.features.spill_memory import GpuMemory, resident_rows, spillable_bytes
 from splatting.registry import part_class
-from splatting.training import run
+from splatting.resources import training_bytes
 from utils.system_utils import UserError
 
 SPILL = ("--gpu_memory", 1)

@@ -11,10 +11,10 @@ import torch
 from PIL import Image
 
 import train
-from splatting.evaluation.peer_curve import read_scalars
-from splatting.findings import environment
-from splatting.training import events
-from splatting.training.events import EventWriter
+from applications.doctor import environment
+from applications.evaluation.peer_curve import read_scalars
+from splatting import events
+from splatting.events import EventWriter
 
 
 def _train(scene: Path, out: Path, *more: str) -> None:

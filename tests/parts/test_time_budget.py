@@ -14,16 +14,16 @@ from gaussians import options
 from trainings import LEARNT, PART_OPTIONS, before_steps, narrow_scene, train_on
 
 from scene.gaussians import density_rules as rules
-from splatting.evaluation.training_log import Stopwatch
-from splatting.parts import time_budget
-from splatting.parts.time_budget import Sizes
-from splatting.parts.time_budget_file import read_schedule, schedule_of, write_schedule
-from splatting.parts.time_budget_schedule import Block, Decided, DecidedSchedule, TimeBudget
+from splatting.features import time_budget
+from splatting.features.time_budget import Sizes
+from splatting.features.time_budget_file import read_schedule, schedule_of, write_schedule
+from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule, TimeBudget
+from splatting.iteration import Iteration
+from splatting.log import ProgressBar
+from splatting.records.training_log import Stopwatch
 from splatting.registry import strategy_part
-from splatting.training.iteration import Iteration
-from splatting.training.log import ProgressBar
-from splatting.training.run import Run
-from splatting.training.schedule import Schedule, longer_steps
+from splatting.run import Run
+from splatting.schedule import Schedule, longer_steps
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -329,7 +329,7 @@ def _timed(monkeypatch: pytest.MonkeyPatch, cost: Callable[[int], float]) -> Non
         def seconds(self) -> float:
             return now[0]
 
-    monkeypatch.setattr("splatting.training.run.Stopwatch", Watch)
+    monkeypatch.setattr("splatting.run.Stopwatch", Watch)
     before_steps(monkeypatch, lambda step: now.append(now.pop() + cost(step.iteration)))
 
 

@@ -19,20 +19,20 @@ from scipy.spatial.transform import Rotation
 
 import export
 import train
+from applications.export.formats import Around, format_of
+from applications.export.html import write_html
+from applications.export.mesh import Mesh
+from applications.export.mesh_files import write_glb_mesh
+from applications.export.scene_formats import write_glb
+from applications.export.upright import check_upright, moved_around, moved_cameras, moved_splats, placed
 from gaussian_renderer import render
+from gaussian_renderer.camera_paths.poses import poses_of
+from groundwork.files.json_files import read_model_json
+from groundwork.files.similarity import Similarity, read_orientation
 from scene.cameras import Camera
 from scene.readers.info import CameraInfo
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
-from splatting.camera_paths.poses import poses_of
-from splatting.exports.formats import Around, format_of
-from splatting.exports.html import write_html
-from splatting.exports.mesh import Mesh
-from splatting.exports.mesh_files import write_glb_mesh
-from splatting.exports.scene_formats import write_glb
-from splatting.exports.upright import check_upright, moved_around, moved_cameras, moved_splats, placed
-from splatting.files.json_files import read_model_json
-from splatting.files.similarity import Similarity, read_orientation
 from utils.system_utils import UserError
 
 TURN = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
@@ -206,8 +206,8 @@ def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
     """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
     points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
     mesh = replace(textured(points), colors=np.zeros((3, 3), np.uint8))
-    monkeypatch.setattr("splatting.exports.mesh.measure", lambda *_: ())
-    monkeypatch.setattr("splatting.exports.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
+    monkeypatch.setattr("applications.export.mesh.measure", lambda *_: ())
+    monkeypatch.setattr("applications.export.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
     for ending, expected in (("ply", points[:, [0, 2, 1]] * [1, 1, -1] if upright else points), ("glb", points)):
         path = tmp_path / f"mesh.{ending}"
         format_of(path).write(path, balls(), around()._replace(upright=upright))

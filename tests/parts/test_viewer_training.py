@@ -19,9 +19,9 @@ from viser_client import Client  # noqa: E402
 from waiting import wait_for  # noqa: E402
 
 import train  # noqa: E402
+from applications.viewer import training_page as observed  # noqa: E402
+from applications.viewer.page import serve  # noqa: E402
 from scene.saved_model import read_model  # noqa: E402
-from splatting.parts import viewer_page as observed  # noqa: E402
-from splatting.viewer.page import serve  # noqa: E402
 
 ITERATIONS = 120
 
@@ -136,7 +136,7 @@ def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypat
 
 def test_nothing_is_drawn_while_nobody_looks(colmap_scene, tmp_path, monkeypatch):
     asked = []
-    monkeypatch.setattr("splatting.viewer.watchers.Watchers.next", lambda *_: asked.append(1))
+    monkeypatch.setattr("applications.viewer.watchers.Watchers.next", lambda *_: asked.append(1))
     watched = Watched(monkeypatch, {})
     _train(colmap_scene, tmp_path / "out", "--no_curve")
     assert not watched.frames and not asked
@@ -178,7 +178,7 @@ def test_a_pause_from_the_start_and_faults_of_the_page_change_no_byte(colmap_sce
         watched.requests.save()
 
     watched = Watched(monkeypatch, {1: begin, 5: Watched.connect, 10: save, 20: save})
-    monkeypatch.setattr("splatting.viewer.frames.Frames.draw", broken)
+    monkeypatch.setattr("applications.viewer.frames.Frames.draw", broken)
     (tmp_path / "out/chkpnt10.pth").mkdir(parents=True)
     expected = _train(colmap_scene, tmp_path / "alone", "--no_curve", viewer=False).read_bytes()
     assert _train(colmap_scene, tmp_path / "out", "--no_curve", "--paused").read_bytes() == expected
@@ -193,7 +193,7 @@ def test_a_pause_from_the_start_and_faults_of_the_page_change_no_byte(colmap_sce
 def test_a_paused_training_that_ends_is_saved_and_the_pause_is_no_time_of_it(colmap_scene, tmp_path, monkeypatch, end):
     before: list[float] = []
     leap, clock = [0.0], time.perf_counter
-    monkeypatch.setattr("splatting.evaluation.training_log.running_seconds", lambda: clock() + leap[0])
+    monkeypatch.setattr("splatting.records.training_log.running_seconds", lambda: clock() + leap[0])
 
     def pause(watched: Watched) -> None:
         before.append(watched.observer._run.clock.seconds)

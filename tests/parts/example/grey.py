@@ -6,7 +6,7 @@ from splatting.option import Option, at_least
 from splatting.part import Error, Options, Part
 
 if TYPE_CHECKING:
-    from splatting.training.iteration import Iteration, Losses, Term
+    from splatting.iteration import Iteration, Losses, Term
 
 
 class Grey(Part):
@@ -21,7 +21,7 @@ class Grey(Part):
     # fmt: on
 
     def begin(self, run: Any, state: Any) -> None:
-        from splatting.training.objective import LossWatch
+        from splatting.objective import LossWatch
 
         self._run = run
         self._mean = LossWatch(0.0 if state is None else state["mean"])  # a running mean, of the whole training

@@ -2,9 +2,9 @@
 
 from typing import Any
 
+from splatting.features.adc import Adc
 from splatting.option import Option, at_least
 from splatting.part import Options
-from splatting.parts.adc import Adc
 
 
 class Patient(Adc):

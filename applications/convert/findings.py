@@ -1,0 +1,306 @@
+"""A capture and its conversion: photos left out, poses that contradict their matches, what to photograph again.
+
+For convert.py's report, and for those that read it: train.py and doctor.py.
+"""
+
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from groundwork.finding import Finding
+from groundwork.host.listing import some
+from scene.checks.photo_files import blurred
+from scene.checks.photos import SHARED_TEXT
+from scene.checks.points import FEWEST_POINTS
+from scene.images.exif import Lens
+from scene.images.exposures import EXPOSURES
+from splatting.registry import tools
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    from applications.convert.report import Model
+
+SHORT_TRACKS = 3.0  # views per point; with fewer, most points depend on a single pair
+LARGE_ERROR = 1.5, 1e-3  # pixels, and share of the longer side; a good model of sharp photos has 0.3 to 1 pixels
+CONTRADICTING = 0.1  # share of the matches; right models had 0.09 at most, wrong ones 0.04 to 0.97
+TURNED = 0.007  # of the longer side, rotation_error; in rooms 0.005 with 3 cm of noise, 0.014 with 10, which is placed
+ALIKE = 0.05  # share of a model's photos that may stand among photos of other things, and are left out
+LONELY = 3  # matching photos of a photo, with which its place is not known well
+SOUND = 0.6  # share of a model's photos that have to agree, or it is called wrong
+OTHER_LENS = 0.02  # difference of a photo's own focal length from its camera's; those of one lens have 0.017 at most
+BETTER = 0.9  # of its error, that a photo of another lens falls below with a focal length of its own
+LEAST = 0.6  # share of the photos, below which too few are placed
+SHARED = 30  # points that a photo shares with another one that is near
+FEW = 2  # such neighbours, with which a photo is weakly connected
+_MANY = 0.05  # share of a camera's photos: a few may be wrong for other reasons
+_FEWEST = 3
+_EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
+_BY_HAND = "--cameras per_photo, or put the photos of each lens into a sub-folder and use --cameras per_folder"
+_OVERLAPPING = "each overlapping the one before by 60 to 80 %"
+
+
+class Look(NamedTuple):
+    """A photo's sharpness (photo_files.sharpness) and brightness (stops)."""
+
+    sharpness: float
+    brightness: float
+
+
+def refuse_nothing(models: "Sequence[Model]", images: Sequence[str], partners: dict[str, int], matcher: str) -> None:
+    """Raise UserError with the likeliest reason if no model has a registered photo."""
+    if models and models[0].registered:
+        return
+    matched = sum(count > 0 for count in partners.values())
+    if matched < 2:
+        reason = "no two of them show the same things sharply enough"
+    else:
+        reason = f"{matched} of them match another photo, but no pair has enough parallax or matches to start from"
+    remedy = "take sharp, evenly lit photos that overlap by 60 to 80 %, from places some steps apart"
+    if matcher == "sequential":
+        remedy += ", or use --matcher auto"
+    raise UserError(f"none of {len(images)} photos could be placed: {reason}; {remedy}")
+
+
+def of_model(
+    models: "Sequence[Model]",
+    images: Sequence[str],
+    partners: dict[str, int],
+    matcher: str,
+    at_limit: int = 0,
+    tried: Sequence[Mapping[str, Any]] = (),
+    more_points: int = 0,
+    mode: str = "",
+) -> Iterator[Finding]:
+    """Weaknesses of the chosen model, models[0], that training will show.
+
+    at_limit: --max_num_features if a photo reached it, else 0. tried: the models of mapping.py, the chosen one first.
+    more_points: of dense_points.py. mode: --cameras.
+    """
+    chosen = models[0]
+    against = list(tried[0].get("against", ())) if tried else []
+    out = sorted(set(images) - set(chosen.registered) - set(against))
+    if tried:
+        yield from _of_judgement(tried[0], len(images), partners, mode)
+        if only_turned(tried[0]) or is_folded(tried[0]):
+            return  # what else is wrong comes of it
+    if out:
+        lonely = sum(partners.get(name, 0) == 0 for name in out)
+        text = f"{len(out)} of {len(images)} photos left out ({some(out)})"
+        text += f", {lonely} of them without a match in another photo" if lonely else ""
+        remedy = "take photos on the way to the others, or remove from input what is blurred or shows something else"
+        remedy += "; --matcher auto compares more than neighbours" if matcher == "sequential" else ""
+        yield Finding(text, remedy)
+    others = [len(model.registered) for model in models[1:] if set(model.registered) - set(chosen.registered)]
+    if others:
+        sizes = f"{len(chosen.registered)} photos are used, the other parts have {', '.join(map(str, others))}"
+        remedy = "take photos that lead from one part to the next"
+        remedy += _unless(mode, ", or try --cameras per_photo if they came through several lenses")
+        yield Finding(f"the photos form {len(others) + 1} unconnected parts ({sizes})", remedy)
+    if (points := chosen.points + more_points) < FEWEST_POINTS:
+        remedy = "use larger or more photos" + (f", or --max_num_features {2 * at_limit}" if at_limit else "")
+        yield Finding(f"only {points} points; a good start needs {FEWEST_POINTS}", remedy)
+    if chosen.track_length < SHORT_TRACKS:
+        text = f"a point is in {chosen.track_length:.1f} photos on average, so the photos overlap little"
+        yield Finding(text, f"take more photos, {_OVERLAPPING}")
+    if _is_large(chosen):
+        remedy = "if objects moved, mask them (--mask_path); for a fisheye lens use --camera OPENCV_FISHEYE"
+        remedy += _unless(mode, "; if the photos come from several lenses, try --cameras per_photo")
+        yield Finding(f"the mean reprojection error is {chosen.error:.1f} pixels", remedy)
+
+
+def _unless(mode: str, text: str) -> str:
+    """Return a text that advises --cameras per_photo, "" if that is the mode."""
+    return "" if mode == "per_photo" else text
+
+
+def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, int], mode: str) -> Iterator[Finding]:
+    """Findings of the matches about the chosen model (mapping.py). partners: matching photos of each photo."""
+    if only_turned(found):
+        text = "the camera turned in one place, as rotations alone explain the matches, so the depths are not known"
+        yield Finding(text, "walk, do not turn: take each photo some steps from the one before")
+        return
+    if is_folded(found):
+        one, other = found["alike_pair"]
+        text = f"parts that look alike are laid upon each other: {one} and {other} stand in one place, and show"
+        text += " different things"
+        yield Finding(text, "take photos that lead from one part to the other, or convert each part by itself")
+        return
+    if not found.get("pairs") and "failed" not in found:
+        text = "the poses could not be judged, since no two photos have enough matches with known focal lengths"
+        yield Finding(text, "look at capture.html, or take more photos that overlap")
+    if is_wrong(found):
+        matches = f"{found['contradicting']:.0%} of the matches that they were made from"
+        remedy = _unless(mode, "if photos are of several lenses, zoomed or cropped, use --cameras per_photo; else ")
+        remedy += "remove photos of other things from input, and take more that overlap"
+        yield Finding(f"the poses contradict {matches}, so they are probably wrong", remedy)
+    lonely = [name for name in found.get("against", ()) if partners.get(name, 0) <= LONELY]
+    if against := sorted(set(found.get("against", ())) - set(lonely)):
+        text = f"{len(against)} of {photos} photos left out ({some(against)}), since their matches contradict the"
+        remedy = _unless(mode, "if they are of another lens, zoomed or cropped, use --cameras per_photo; else ")
+        yield Finding(f"{text} others", f"{remedy}remove them from input, and take more there")
+    if lonely:
+        text = f"{len(lonely)} of {photos} photos left out ({some(lonely)}), since too few others match them"
+        yield Finding(text, f"take more there, {_OVERLAPPING}")
+
+
+def is_wrong(found: Mapping[str, Any]) -> bool:
+    """Tell a judged model that is wrong, although it is the best. One without pairs cannot be judged."""
+    if not found.get("pairs"):
+        return False
+    is_split = found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
+    return is_split or only_turned(found) or is_folded(found)
+
+
+def is_folded(found: Mapping[str, Any]) -> bool:
+    """Tell a judged model that lays parts which look alike upon each other."""
+    return len(found.get("alike", ())) > ALIKE * found.get("photos", 0)
+
+
+def only_turned(found: Mapping[str, Any]) -> bool:
+    """Tell a judged model of a camera that stood in one place."""
+    error = found.get("rotation")
+    return error is not None and error < TURNED
+
+
+def _is_large(model: "Model") -> bool:
+    """Whether the error is that of a weak model, in photos of its size."""
+    pixels, share = LARGE_ERROR
+    return model.error > max([pixels, *(share * max(camera["size"]) for camera in model.cameras)])
+
+
+def of_given_poses(model: "Model", images: Sequence[str]) -> Iterator[Finding]:
+    """Weaknesses of a model at given poses. UserError if the photos contradict the poses."""
+    fit = f"{model.points} points, mean error {model.error:.1f} pixels"
+    remedy = "check that the poses and lenses are of these photos"
+    if model.points < len(model.registered):
+        raise UserError(f"the photos do not fit the given poses ({fit}); {remedy}, or omit --poses")
+    if out := sorted(set(images) - set(model.registered)):
+        text = f"{len(out)} of {len(images)} photos have no pose in the file and were left out ({some(out)})"
+        yield Finding(text, "add their poses, or omit --poses")
+    if model.points < FEWEST_POINTS or _is_large(model):
+        remedies = "; ".join((remedy, *(remedy_of(True) for remedy_of in tools("for_wrong_poses"))))
+        yield Finding(f"the photos fit the given poses badly ({fit})", remedies)
+
+
+def of_shared_cameras(
+    cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str, frames: Collection[str] = ()
+) -> Iterator[Finding]:
+    """Cameras whose photos seem to come through several lenses, and missing EXIF data.
+
+    known: lenses by EXIF. mode: --cameras. frames: of videos, which never have EXIF data.
+    """
+    for camera in cameras:
+        fits = {name: fit for name, fit in camera["photos"].items() if fit}
+        other = [name for name, fit in fits.items() if _is_other(*fit)]
+        if len(other) >= max(_FEWEST, _MANY * len(fits)):
+            factors = sorted(fits[name][0] for name in other)
+            several = len({known.get(name) for name in camera["photos"]}) > 1
+            yield Finding(
+                f"{len(other)} of {len(camera['photos'])} photos that share a camera ({some(other)}) fit better with "
+                f"{factors[0]:.2f} to {factors[-1]:.2f} times its focal length, as photos through several lenses, or "
+                "zoomed or cropped ones do",
+                "convert again with " + ("--cameras per_lens" if several else _BY_HAND),
+            )
+    photos = [name for name in known if name not in frames]
+    silent = [name for name in photos if not known[name].tells_apart]
+    if mode == "per_lens" and 0 < len(silent) < len(photos):
+        text = f"the EXIF data of {len(silent)} of {len(photos)} photos name no lens ({some(silent)}), and those of"
+        remedy = f"if they came through several lenses, use {_BY_HAND}"
+        yield Finding(f"{text} one size and folder share a camera", remedy)
+
+
+def _is_other(factor: float, error: float, own_error: float) -> bool:
+    return abs(factor - 1) > OTHER_LENS and own_error < BETTER * error
+
+
+def neighbours_of(photos: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
+    """The photos with which each placed photo shares enough points, most first."""
+    return {
+        name: [other for other, count in sorted(photo["shared"].items(), key=lambda one: -one[1]) if count >= SHARED]
+        for name, photo in photos.items()
+    }
+
+
+def worth(
+    report: Mapping[str, Any], photos: Mapping[str, Mapping[str, Any]], looks: Mapping[str, Look]
+) -> dict[str, Any]:
+    """What a capture is worth, for convert_report.json.
+
+    report: the content of that file so far. photos: of capture.json. looks: of all photos, `compared`. Returns
+    `weakly_connected` and `blurred`, names of photos; `brightness_spread_stops`, of the placed ones, which train, or
+    None; and `again`, a line for each thing to photograph again.
+    """
+    neighbours = neighbours_of(photos)
+    against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}
+    weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
+    soft = blurred({name: look.sharpness for name, look in looks.items()})
+    bright = [look.brightness for name, look in looks.items() if name in photos and math.isfinite(look.brightness)]
+    spread = round(float(np.std(bright)), 3) if bright else None
+    if any(SHARED_TEXT in line for line in report.get("advice", ())):  # why photos are left out or weakly connected
+        again = _again([], [], soft, spread)
+    else:
+        again = _again(sorted(set(report["left_out"]) - against), weak, soft, spread)
+    return {
+        "weakly_connected": weak,
+        "blurred": soft,
+        "brightness_spread_stops": spread,
+        "again": again,
+    }
+
+
+def _again(left_out: list[str], weak: list[str], soft: list[str], spread: float | None) -> list[str]:
+    lines = []
+    if left_out:
+        lines.append(
+            f"what {some(left_out)} show, if it belongs to the scene: take photos on the way from there to the others, "
+            f"{_OVERLAPPING}"
+        )
+    if weak:
+        lines.append(f"around {some(weak)}: fewer than {FEW} other photos share points with each; take more there")
+    if soft:
+        lines.append(f"{some(soft)}: blurred; hold the camera still, or add light")
+    if spread and spread > EXPOSURES:
+        lines.append(
+            f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
+            f"with {_EXPOSURES}"
+        )
+    return lines
+
+
+def lines_of(report: Mapping[str, Any]) -> list[str]:
+    """The report of a capture in a few lines, after its summary."""
+    weak, soft = report["weakly_connected"], report["blurred"]
+    lines = []
+    if weak or not unusable(report):
+        few = f"{len(weak)} of {report['registered']} photos weakly connected ({some(weak)})"
+        lines.append(f"overlap: {few if weak else 'no photo is weakly connected'}")
+    said = f"{len(soft)} of {report['photos']} photos blurred ({some(soft)})"
+    lines.append(f"blur: {said if soft else 'no photo is blurred'}")
+    if (spread := report["brightness_spread_stops"]) is not None:
+        lines.append(f"brightness: the photos differ by {spread:.2f} stops")
+    lines += [f"photograph again {line}" for line in report["again"]]
+    return lines
+
+
+def training_options(report: Mapping[str, Any]) -> str:
+    """Options of train.py that lines of the report name; "" if there are none."""
+    return _EXPOSURES if any(_EXPOSURES in line for line in report["again"]) else ""
+
+
+def unusable(report: Mapping[str, Any]) -> str | None:
+    """What to say where too few photos are placed, or where they contradict each other."""
+    placed, count = report["registered"], report["photos"]
+    if report.get("tried") and only_turned(report["tried"][0]):
+        return "the camera turned in one place, so do not train on this scene; walk, do not turn"
+    if report.get("tried") and is_folded(report["tried"][0]):
+        return "parts that look alike are laid upon each other in it, so do not train on this scene"
+    if report.get("tried") and is_wrong(report["tried"][0]):
+        return "no way of mapping found poses that agree with the photos' matches, so do not train on this scene"
+    if placed >= LEAST * count:
+        return None
+    return (
+        f"only {placed} of {count} photos are placed, so the scene is incomplete; capture.html in it says what to "
+        "photograph again"
+    )

@@ -1,0 +1,130 @@
+"""Mapping in several ways, until a model agrees with the pairs of photos that it was made from (scene/agreement.py).
+
+Each way fails on some captures, without saying so. The best model is kept, without photos that contradict the others.
+"""
+
+import shutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from applications.convert.colmap import (
+    ADDING,
+    ALL_PAIRS,
+    GIVEN,
+    Backend,
+    Command,
+    copy_database,
+    count_rows,
+    names_in,
+    worker_command,
+)
+from applications.convert.findings import is_folded, is_wrong, only_turned
+from groundwork.files.json_files import read_json, write_json
+from utils.system_utils import UserError
+
+AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
+_FOLDED = 2  # ways that fold a scene, after which no other is tried
+_NAMES = {
+    "simple": "global mapping, at first without distortion",
+    "free": "incremental mapping without given focal lengths",
+}
+
+
+def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str, Any], None]) -> None:
+    """Fill `layout.models` with the models of the best way, and `layout.judged`.
+
+    run: runs commands. place: runs those of a way under a title.
+    """
+    layout = backend.layout
+    if backend.settings.mapper == GIVEN:
+        place("Mapping", backend.mapping(GIVEN, layout.models))
+        return
+    copy_database(layout.database, layout.calibrated)
+    try:
+        run(backend.calibration(), "Calibrating")
+    except UserError as error:  # some ways do without
+        print(f"warning: focal lengths could not be estimated: {error}", file=sys.stderr)
+    tried: list[dict[str, Any]] = []
+    few = count_rows(layout.database, "images") <= ALL_PAIRS
+    ways = sorted(backend.ways, key=lambda way: (way == "free", few and way != "incremental"))
+    for number, way in enumerate(ways):
+        title = "Mapping" if not number else f"Mapping, try {number + 1}"
+        tried.append(_tried(backend, way, partial(place, title), run))
+        if agrees(tried[-1]) or only_turned(tried[-1]) or sum(map(is_folded, tried)) == _FOLDED:
+            break
+        if number + 1 < len(ways):
+            print(f"{_words(tried[-1])}; trying {name_of(ways[number + 1])}")
+    tried = sorted(tried, key=partial(_rank, tried), reverse=True)
+    best = tried[0]
+    if "failed" in best:
+        if not any((layout.tried / best["way"]).glob("*/*")):
+            raise UserError(best["failed"])
+        print(f"warning: the poses could not be judged: {best['failed']}", file=sys.stderr)
+    (layout.tried / best["way"]).rename(layout.models)
+    shutil.rmtree(layout.tried, ignore_errors=True)
+    if not is_folded(best):
+        best["against"] = sorted({*best.get("against", ()), *best.get("alike", ())})
+    if best.get("against") and backend.settings.mapper == ADDING:
+        old = set(names_in(layout.base_database))
+        best["against"] = [name for name in best["against"] if name not in old]
+    if best.get("against") and not is_folded(best):
+        model = str(layout.models / best["folder"])
+        run([worker_command(layout, "keep", model=model, left_out=best["against"])], "Leaving out photos")
+        best |= {**_judgement(backend, layout.models, run), "against": best["against"]}  # of those that are left
+    write_json(layout.judged, tried)
+
+
+def agrees(found: Mapping[str, Any]) -> bool:
+    """Whether a judged model is kept without another try."""
+    return found.get("agreeing", 0) >= AGREEING * found.get("bound", 0) > 0 and not is_wrong(found)
+
+
+def _tried(
+    backend: Backend, way: str, place: Callable[[list[Command]], None], run: Callable[..., None]
+) -> dict[str, Any]:
+    """Map in one way, and judge what comes out. `failed` is a message, instead of what the judgement found."""
+    start, models = time.monotonic(), backend.layout.tried / way
+    try:
+        place(backend.mapping(way, models))
+        found = _judgement(backend, models, run)
+    except UserError as error:
+        found = {"failed": str(error)}
+    return {"way": way, "seconds": round(time.monotonic() - start, 1)} | found
+
+
+def _judgement(backend: Backend, models: Path, run: Callable[..., None]) -> dict[str, Any]:
+    out = backend.layout.work / "judging.json"
+    places = {"models": str(models), "calibrated": str(backend.layout.calibrated), "out": str(out)}
+    run([worker_command(backend.layout, "judging", **places)], "Judging")
+    return read_json(out)
+
+
+def _rank(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
+    """Return how good a model is among those that were tried, as a sort key.
+
+    One that is far smaller than another may be right by chance. One that lacks photos of a folded model may be folded
+    where these would show it.
+    """
+    photos, most = found.get("photos", 0), max(one.get("photos", 0) for one in tried)
+    folded = max((one["photos"] for one in tried if is_folded(one)), default=0)
+    is_sound = not is_wrong(found) and 2 * photos >= most and photos >= AGREEING * folded
+    return photos > 0, is_sound, found.get("agreeing", 0), photos
+
+
+def name_of(way: str) -> str:
+    return _NAMES.get(way, f"{way} mapping")
+
+
+def _words(found: Mapping[str, Any]) -> str:
+    if "failed" in found:
+        return f"{name_of(found['way'])} failed"
+    if not found.get("photos"):
+        return f"{name_of(found['way'])} placed no photo"
+    if is_folded(found):
+        return f"{name_of(found['way'])} laid photos of different things upon each other"
+    agree = f"{found['agreeing']} of {found['bound']} photos"
+    return f"{name_of(found['way'])}: the matches of {agree} agree with their poses"

@@ -1,0 +1,152 @@
+"""Where a converted scene is upright, and how large a metre is in it (convert.py --orient).
+
+The vertical is that of gravity in photos' EXIF data, else that of the photos' horizons and GPS, if they tell it. GPS
+gives the metre and the north. In the frame that results, y is down; with GPS, x is east and z is north.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from applications.convert.georeference import Cameras, Fit, fit, is_level
+from applications.convert.layout import Layout
+from groundwork.files.json_files import write_json
+from groundwork.files.similarity import PLACE, read_orientation
+from scene.images.exif import PhotoPlace, read_place
+from scene.readers.colmap import read_model
+
+FEWEST = 3  # photos with a GPS place
+_SIZE = 0.1  # standard error of the scale, above which GPS does not tell it
+_AGREE = np.cos(np.radians(30))  # of gravity in a photo with that in most others, and with the vertical of horizons
+
+
+def orient(layout: Layout) -> None:
+    """Write the similarity of a converted scene, `layout.orientation`; where no vertical is known, only the scale."""
+    images = sorted(read_model(layout.sparse / "0").images, key=lambda image: image.name)
+    turns = np.stack([image.qvec2rotmat().T for image in images])
+    centers = np.stack([-turn @ image.tvec for turn, image in zip(turns, images, strict=True)])
+    photos = [read_place(_photo(layout, image.name)) for image in images]
+    middle, (reference, places) = np.median(centers, axis=0), _places(photos)
+    cameras = Cameras(turns, centers - middle, places)
+    vertical, found = _vertical(cameras, photos)
+    record: dict[str, Any] = {"unit": "scene", "gps_seen": int(np.isfinite(places[:, 0]).sum())} | vertical
+    rotation, scale = found.rotation if vertical["vertical"] else np.eye(3), 1.0
+    if _is_metric(found, cameras):
+        scale = found.scale
+        record |= {"unit": "metre", "scale_error": found.size, "gps_photos": int(found.fits.sum())}
+        record |= {"gps_error": _error(found, cameras)} | (_origin(found, reference) if vertical["vertical"] else {})
+    translation = -scale * rotation @ middle
+    record |= {"rotation": rotation.tolist(), "scale": scale, "translation": translation.tolist()}
+    write_json(layout.orientation, record)
+
+
+def said_of(layout: Layout) -> list[str]:
+    """A line on what `orient` found; none if it was not asked for."""
+    if (record := read_orientation(layout.scene)) is None:
+        return []
+    if record["vertical"] is None:
+        level = (
+            "upright: not known, as neither the photos' horizons nor GPS tell it; add photos to several sides, or GPS"
+        )
+    else:
+        turn = np.degrees(np.arccos(np.clip(record["rotation"][1][1], -1, 1)))
+        error = record.get("vertical_error")
+        level = f"upright: tilted by {turn:.1f} degrees{f' (to {error:.1f})' if error else ''}, by {record['vertical']}"
+    if record["unit"] == "metre":
+        if "gps_photos" not in record:
+            return [f"{level}; a unit is {record['scale']:.4g} m, as measured in the viewer"]
+        error = f" (to {record['scale_error']:.1%})" if "scale_error" in record else ""
+        used = f"GPS of {record['gps_photos']} photos, which fit to {record['gps_error']:.2g} m"
+        return [f"{level}; a unit is {record['scale']:.4g} m{error} by {used}"]
+    if (seen := record.get("gps_seen", 0)) < FEWEST:
+        return [f"{level}; no scale: it needs {FEWEST} photos with GPS, and has {seen}"]
+    return [f"{level}; no scale: GPS of {seen} photos is too near to each other, or does not fit the poses"]
+
+
+def _vertical(cameras: Cameras, photos: Sequence[PhotoPlace]) -> tuple[dict[str, Any], Fit]:
+    """What is recorded of the vertical, and the fit to it.
+
+    GPS takes part where neither gravity nor horizons tell it: heights of phones are away together, by many metres.
+    """
+    level = fit(cameras._replace(places=np.full_like(cameras.places, np.nan)))
+    if measured := _measured_up(cameras.turns, level, photos):
+        up, text = measured
+        return {"vertical": text}, fit(cameras, up)
+    if is_level(level):
+        error, up = float(np.degrees(level.tilt)), -level.rotation[1]
+        return {"vertical": f"the horizons of {len(photos)} photos", "vertical_error": error}, fit(cameras, up)
+    found = fit(cameras)
+    if not (_is_metric(found, cameras) and is_level(found)):
+        return {"vertical": None}, found
+    horizons = f"the horizons of {len(photos)} photos and " if found.by_level < 2 * found.tilt else ""
+    text = f"{horizons}GPS of {found.fits.sum()} photos"
+    return {"vertical": text, "vertical_error": float(np.degrees(found.tilt))}, found
+
+
+def _is_metric(found: Fit, cameras: Cameras) -> bool:
+    """Whether GPS tells the scale: of photos enough, of which most fit."""
+    return found.size < _SIZE and found.fits.sum() >= max(FEWEST, np.isfinite(cameras.places[:, 0]).sum() / 2)
+
+
+def _places(photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, np.ndarray]:
+    """A place on Earth (degrees, degrees, m) amid the photos, and theirs (N,3), metres east, down and north of it.
+
+    NaN where unknown. Heights that are all equal count as unknown: GPS does not measure such.
+    """
+    gps = np.array([photo.gps or (np.nan,) * 3 for photo in photos])
+    here = np.isfinite(gps[:, 0])
+    places, heights = np.full_like(gps, np.nan), gps[np.isfinite(gps[:, 2]), 2]
+    if not here.any():
+        return np.zeros(3), places
+    filled = np.where(np.isfinite(gps[here]), gps[here], np.median(heights) if len(heights) else 0.0)
+    earth = _earth()
+    # Not the median of degrees, which is far away from photos around a pole or at a longitude of 180 degrees.
+    reference = earth.ecef_to_ellipsoid(np.median(earth.ellipsoid_to_ecef(filled), axis=0)[None])[0]
+    places[here] = earth.ellipsoid_to_enu(filled, *reference)[:, [0, 2, 1]] * [1, -1, 1]
+    places[np.isnan(gps[:, 2]) | (len(set(heights)) < 2), 1] = np.nan
+    return reference, places
+
+
+def _earth() -> Any:
+    import pycolmap
+
+    return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+
+
+def _error(found: Fit, cameras: Cameras) -> float:
+    """By how much the places that fit are away from their GPS along the ground, mean, in metres."""
+    away = found.scale * cameras.centers @ found.rotation.T + found.shift - cameras.places
+    return float(np.hypot(away[found.fits, 0], away[found.fits, 2]).mean())
+
+
+def _origin(found: Fit, reference: np.ndarray) -> dict[str, float]:
+    """Where on Earth the middle of the photos is."""
+    east, down, north = found.shift
+    place = _earth().enu_to_ellipsoid(np.array([[east, north, -down]]), *reference)[0]
+    return dict(zip(PLACE, place.tolist(), strict=True))
+
+
+def _measured_up(turns: np.ndarray, level: Fit, photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, str] | None:
+    """Up by gravity of the photos that have it, and what is said of it.
+
+    None if none has, or if most contradict each other, or the known vertical of all.
+    """
+    having = [number for number, photo in enumerate(photos) if photo.down is not None]
+    if not having:
+        return None
+    ups = np.stack([-turns[number] @ photos[number].down for number in having])
+    most = -level.rotation[1] if is_level(level) else np.median(ups, axis=0)
+    ups = ups[ups @ most > _AGREE * np.linalg.norm(most)]
+    if 2 * len(ups) <= len(having):
+        return None
+    up = np.median(ups, axis=0)
+    return up / np.linalg.norm(up), f"gravity of {len(ups)} photos"
+
+
+def _photo(layout: Layout, name: str) -> Path:
+    """The file that a photo of the model was made from, which has all of its EXIF data."""
+    kept = layout.input / name
+    changed = kept.with_name(kept.stem)  # without the suffix that was appended for COLMAP
+    return next((path for path in (kept, changed) if path.is_file()), layout.images / name)

@@ -1,0 +1,88 @@
+"""Colours of photos by their ICC profiles, also those of color_tags.py: other spaces become sRGB, as all else here."""
+
+import functools
+import io
+import sys
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image, ImageCms
+from tqdm import tqdm
+
+from groundwork.files.color_tags import UNKNOWN
+from groundwork.files.image_files import eight_bits, sixteen_bits
+
+_NEAR = 2  # of 255, that profiles of sRGB by several makers differ
+_MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # Pillow's modes of the spaces that profiles are of
+_SAID: set[str] = set()
+
+
+class _Change(NamedTuple):
+    """How colours in a mode of Pillow become sRGB, None: they stay; and what to say of it, "" for nothing."""
+
+    transform: ImageCms.ImageCmsTransform | None
+    mode: str = ""
+    said: str = ""
+
+
+def has_other_colors(image: Image.Image) -> bool:
+    """Whether a photo's profile gives it other colours than sRGB would, by its header. Says so, once for a profile."""
+    return _change_of(image).transform is not None
+
+
+def in_srgb(image: Image.Image) -> Image.Image:
+    """A photo in sRGB by its profile, RGB or RGBA; the photo itself without a profile, or with one of no effect."""
+    change = _change_of(image)
+    if change.transform is None:
+        return image
+    alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
+    if image.mode.startswith("I"):
+        image = sixteen_bits(image) if change.mode == "I;16" else eight_bits(image)
+    result = change.transform.apply(image if image.mode == change.mode else image.convert(change.mode))
+    if alpha:
+        result.putalpha(alpha)
+    return result
+
+
+def _change_of(image: Image.Image) -> _Change:
+    mode = "I;16" if image.mode.startswith("I") else {"LA": "L", "1": "L"}.get(image.mode, image.mode)
+    if profile := image.info.get("icc_profile"):
+        change = _read(profile, mode)
+    elif unknown := image.info.get(UNKNOWN):
+        change = _Change(None, said=f"warning: photos are taken as sRGB, though their colours are of {unknown}")
+    else:
+        return _Change(None)
+    if change.said and change.said not in _SAID:
+        _SAID.add(change.said)
+        name = getattr(image, "filename", "")
+        tqdm.write(f"{change.said}; the first is {name}" if name else change.said, file=sys.stderr)
+    return change
+
+
+@functools.lru_cache(maxsize=64)
+def _read(profile: bytes, mode: str) -> _Change:
+    grey = mode in ("L", "I;16")
+    try:
+        source, target = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")
+        space = _MODES.get(source.profile.xcolor_space.strip(), "")
+        if space != ("L" if grey else "CMYK" if mode == "CMYK" else "RGB") and not (grey and space == "RGB"):
+            raise ValueError("it is of another kind of photo")
+        mode = mode if grey and space == "L" else space
+        transform = ImageCms.buildTransform(source, target, mode, "RGB")
+        name = " ".join(ImageCms.getProfileDescription(source).split())
+    except (ImageCms.PyCMSError, ImportError, OSError, ValueError, TypeError) as error:
+        return _Change(None, said=f"warning: colour profiles are ignored that cannot be followed ({error})")
+    if space != "CMYK" and _is_srgb(transform, "L" if grey else "RGB"):
+        return _Change(None)
+    return _Change(transform, mode, f"photos with the colour profile {name} are converted to sRGB")
+
+
+def _is_srgb(transform: ImageCms.ImageCmsTransform, shown: str) -> bool:
+    """Whether a transform leaves colours as they are. shown: L for a photo of greys, else RGB."""
+    steps = np.arange(0, 256, 17, dtype=np.uint8)
+    colors = np.stack([steps] * 3 if shown == "L" else np.meshgrid(*[steps] * 3), -1).reshape(-1, 16, 3)
+    given = Image.fromarray(np.ascontiguousarray(colors))
+    if transform.input_mode == "I;16":
+        given = Image.fromarray(np.asarray(given.convert("L")).astype(np.uint16) * 257)
+    made = np.asarray(transform.apply(given.convert(transform.input_mode)), np.int16)
+    return bool(np.abs(made - colors).max() <= _NEAR)

@@ -1,0 +1,75 @@
+"""The record of a scene's similarity from points that somebody has measured, as convert.py --orient keeps it."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from groundwork.files.similarity import PLACE, Similarity
+from groundwork.host.errors import UserError
+
+TINY = 1e-300  # instead of a length of 0
+_OF_GPS = "gps_photos", "gps_error", "scale_error"
+
+
+def measured_record(
+    before: Mapping[str, Any] | None,
+    above: np.ndarray,
+    scale: float | None = None,
+    ground: np.ndarray | None = None,
+    front: np.ndarray | None = None,
+) -> dict[str, Any]:
+    """A record in place of that before, None: there was none. Points are of the scene's world.
+
+    above: a point (3,) above the ground. scale: metres in its unit. ground: three points (3,3) that are level, their
+    middle becomes the origin. front: two points (2,3), from the left to the right of what is to be looked at straight
+    on. What is not given stays; with ground or front, the place on Earth is not known any more. UserError for points
+    that tell nothing.
+    """
+    record = dict(before or {"unit": "scene", "vertical": None})
+    known = Similarity.of(record, "orientation") if before else Similarity(np.eye(3), 1.0, np.zeros(3), upright=False)
+    axes, origin = known.rotation, -known.rotation.T @ known.translation / known.scale
+    if ground is not None:
+        down = _unit(ground_normal(ground), "the three points of the ground lie on a line; choose others")
+        down = -down if (above - ground[0]) @ down > 0 else down
+        axes, origin = _level(axes, down), ground.mean(0)
+        record["vertical"] = "three points of the ground"
+        record.pop("vertical_error", None)
+    if front is not None:
+        if record["vertical"] is None:
+            raise UserError("a front needs to know what is up; click three points of the ground, too")
+        along = front[1] - front[0]
+        along /= np.linalg.norm(along).clip(TINY)
+        right = _unit(along - (along @ axes[1]) * axes[1], "the front goes straight up; choose other points")
+        axes = np.stack([right, axes[1], np.cross(right, axes[1])])
+    if ground is not None or front is not None:
+        record = {name: value for name, value in record.items() if name not in PLACE}
+    if scale is not None:
+        record = {name: value for name, value in record.items() if name not in _OF_GPS} | {"unit": "metre"}
+    scale = known.scale if scale is None else scale
+    translation = -scale * axes @ origin
+    return record | {"rotation": axes.tolist(), "scale": scale, "translation": translation.tolist()}
+
+
+def ground_normal(ground: np.ndarray) -> np.ndarray:
+    """A normal (3,) of three points (3,3), as long as the triangle's least height in parts of its longest side."""
+    sides = np.roll(ground, 1, 0) - ground
+    longest = np.square(sides).sum(1).max()
+    return np.cross(sides[0], sides[1]) / longest.clip(TINY)
+
+
+def _unit(vector: np.ndarray, fault: str) -> np.ndarray:
+    """A vector (3,) at length 1, if it is at least 1e-6 long. UserError with a fault if not, or if it is not finite."""
+    length = np.linalg.norm(vector)
+    if not 1e-6 <= length < np.inf:
+        raise UserError(fault)
+    return vector / length
+
+
+def _level(axes: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """Axes (3,3), by rows, with another y (3,), that else differ as little as they can."""
+    ahead = axes[2] - (axes[2] @ down) * down
+    if np.linalg.norm(ahead) < 1e-3:  # it looked straight down
+        ahead = axes[1] - (axes[1] @ down) * down
+    ahead /= np.linalg.norm(ahead)
+    return np.stack([np.cross(down, ahead), down, ahead])

@@ -1,0 +1,138 @@
+"""Start of a command: signals, garbage, outputs, kept memory and the GPU's context, before its imports.
+
+Importing torch makes half a million objects that stay. Python's collector would go through them several times meanwhile
+and once more at the end, which takes a third of the seconds of a process that does nothing else.
+"""
+
+import ctypes
+import gc
+import importlib.util
+import io
+import os
+import shlex
+import signal
+import sys
+import threading
+from pathlib import Path
+
+from groundwork.host import torchrun
+from groundwork.host.interrupt import raise_on_signals
+from groundwork.host.programs import find_program, forget_relative_path
+
+_TRIM, _SEPARATE = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of mallopt
+_KEPT = 256 << 20  # bytes that may lie free
+_LARGE = 32 << 20  # bytes of an allocation that is given back as soon as it is freed; glibc allows no more
+_ROOT = Path(__file__).resolve().parents[2]
+_DRIVER = "libcuda.so.1"
+_waiting = False  # whether the collector is
+
+
+def prepare() -> None:
+    """Call before a command's imports, which take a second: Ctrl-C then ends it at once, without a traceback.
+
+    Python raises KeyboardInterrupt inside whatever is being imported, and some packages swallow it. A SIGINT that is
+    ignored, as in the background of a shell, stays ignored.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    global _waiting
+    _waiting = gc.isenabled()
+    gc.disable()
+    open_outputs()
+    keep_freed_memory()
+
+
+def imported() -> None:
+    """Call when all is imported: signals raise exceptions from now on, and garbage is collected, but for the imports.
+
+    Programs are not looked for in the current folder.
+
+    Without `prepare`, as where other code calls this, its garbage is its own.
+    """
+    forget_relative_path()
+    global _waiting
+    if _waiting:
+        gc.freeze()
+        gc.enable()
+        _waiting = False
+    if "numpy" in sys.modules:
+        import numpy.random  # noqa: F401  (or numpy would import it later, and might swallow a signal)
+    if threading.current_thread() is threading.main_thread():
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        raise_on_signals()
+    open_outputs()
+
+
+def open_outputs() -> None:
+    """Let an output that is closed (`>&-`) lead nowhere, and one that cannot write a letter write its number."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  (open to the end)
+            setattr(sys, name, nowhere)
+            setattr(sys, f"__{name}__", nowhere)
+        elif isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+
+def keep_freed_memory() -> None:
+    """Keep freed memory for the next allocation; by default glibc returns it to the system.
+
+    A step on the CPU frees as much memory as the next one takes, which the system would have to clear again: up to a
+    tenth of a training (docs/inside/notebook.md). Nothing changes without glibc, or where the environment sets limits.
+    """
+    if any(name.startswith("MALLOC_") or name == "GLIBC_TUNABLES" for name in os.environ):
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError, TypeError):
+        return
+    mallopt(_SEPARATE, _LARGE)
+    mallopt(_TRIM, _KEPT)
+
+
+def begin_cuda() -> threading.Thread | None:
+    """Make the context that torch will find there, in a thread; None if this installation computes on the CPU.
+
+    The driver's calls leave Python's lock to the imports. Without a driver or a GPU nothing happens, and torch says
+    what there is to say. The program ends after the thread.
+    """
+    if not _computes_on_a_gpu():
+        return None
+    thread = threading.Thread(target=_make_context, name="cuda start")
+    thread.start()
+    return thread
+
+
+def _computes_on_a_gpu() -> bool:
+    """Whether the rasterizer was built with CUDA kernels: its library then asks torch for a stream."""
+    found = importlib.util.find_spec("diff_gaussian_rasterization")
+    library = found and found.origin and Path(found.origin).with_name("_backend.so")
+    try:
+        return bool(library) and b"aoti_torch_get_current_cuda_stream" in library.read_bytes()
+    except OSError:
+        return False
+
+
+def _make_context() -> None:
+    """Retain the primary context of the visible GPU that torch will compute on."""
+    try:
+        driver = ctypes.CDLL(_DRIVER)
+        device, context = ctypes.c_int(), ctypes.c_void_p()
+        if driver.cuInit(0) == 0 and driver.cuDeviceGet(ctypes.byref(device), torchrun.local_rank()) == 0:
+            driver.cuDevicePrimaryCtxRetain(ctypes.byref(context), device)
+    except (OSError, AttributeError):  # no driver, or another one of that name
+        pass
+
+
+def typed_command(script: str) -> str:
+    """How a command of this program is called from here: its Python (python where that is what runs), and its path."""
+    found, own = find_program("python"), Path(sys.executable)
+    python = "python" if found and Path(found).absolute() == own.absolute() else _typed(own)
+    return f"{python} {_typed(_ROOT / script)}"
+
+
+def _typed(path: Path) -> str:
+    here = Path.cwd()
+    return shlex.quote(str(path.relative_to(here) if here in path.parents and here != here.parent else path))

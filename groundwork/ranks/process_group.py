@@ -1,0 +1,114 @@
+"""Several processes that train together, by torch.distributed: gloo on CPUs, NCCL on GPUs."""
+
+from collections.abc import Callable, Sequence
+from datetime import timedelta
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from groundwork.host.read_later import read_later
+from groundwork.ranks.ranks import Ranks, Value
+
+# Into one tensor. The older name warns where there is a newer one.
+ALL_GATHER = "all_gather_single" if hasattr(dist, "all_gather_single") else "all_gather_into_tensor"
+_NEWS = 2  # numbers that are posted
+# Of a collective call, after which a rank that does not come to it is taken for hung. No work of one rank that the
+# others wait for may take longer, as rank 0 writing a checkpoint.
+TIMEOUT = timedelta(minutes=2)
+
+
+class SeveralRanks(Ranks):
+    """The ranks of the default process group.
+
+    Numbers and objects of the host go by a group of CPUs. Tensors go by NCCL, where the group has it, or else by way of
+    the CPU.
+    """
+
+    def __init__(self) -> None:
+        self.rank, self.size = dist.get_rank(), dist.get_world_size()
+        by_gpu = dist.get_backend() == "nccl"
+        self._place = "cuda" if by_gpu else "cpu"  # of what the default group sends
+        self._numbers = dist.new_group(backend="gloo", timeout=TIMEOUT) if by_gpu else dist.group.WORLD
+        self._silence = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)
+        self._news, self._heard = [0] * _NEWS, [0] * _NEWS
+
+    def leave(self) -> None:
+        """Leave the group, and end its threads. One that met the end of Python would abort the process."""
+        self._numbers = None  # which keeps the threads
+        dist.destroy_process_group()
+
+    def numbers(self, *values: int) -> Tensor:
+        mine = torch.tensor(values, dtype=torch.int64)
+        everyone = [torch.empty_like(mine) for _ in range(self.size)]
+        dist.all_gather(everyone, mine, group=self._numbers)
+        return torch.stack(everyone)
+
+    def shared(self, value: Value, holder: int = 0) -> Value:
+        box = [value]
+        dist.broadcast_object_list(box, src=holder, group=self._numbers)
+        return box[0]
+
+    def handed(
+        self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
+    ) -> Tensor:
+        if self.rank == holder:
+            dist.broadcast(values.detach().contiguous().to(self._place), holder)
+            return values
+        received = torch.empty(shape, dtype=dtype, device=self._place)
+        dist.broadcast(received, holder)
+        return received.to(device)
+
+    def everyone(self, value: Value) -> list[Value]:
+        box: list = [None] * self.size
+        dist.all_gather_object(box, value, group=self._numbers)
+        return box
+
+    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
+        news = torch.tensor(self._news, device=self._place) if any(self._news) else self._silence
+        flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
+        found = read_later(self._table(torch.cat((numbers.to(self._place), flag, news))))
+        meanwhile()
+        found = found()
+        first = len(numbers)
+        flags = [row[first] for row in found]
+        if flags[self.rank] < max(flags):
+            self.flag.fill_(max(flags))
+        self._heard = [max(each) for each in zip(*(row[first + 1 :] for row in found), strict=True)]
+        return [row[:first] for row in found]
+
+    def post(self, *news: int) -> None:
+        self._news, self._heard = news, None
+
+    def heard(self) -> Sequence[int]:
+        if self._heard is None:
+            self.agree(self._silence[:0])
+        return self._heard
+
+    def table(self, values: Tensor) -> Tensor:
+        return self._table(values.detach().contiguous().to(self._place)).to(values.device)
+
+    def _table(self, mine: Tensor) -> Tensor:
+        every = mine.new_empty(self.size * mine.numel())
+        getattr(dist, ALL_GATHER)(every, mine.view(-1))
+        return every.view(self.size, *mine.shape)
+
+    def added(self, values: Tensor) -> Tensor:
+        total = values.detach().to(self._place)
+        dist.all_reduce(total)
+        return total.to(values.device)
+
+    def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
+        counts = self._counts(sizes) if counts is None else list(counts)
+        sent = rows.detach().to(self._place).contiguous()
+        received = sent.new_empty(sum(counts), *rows.shape[1:])
+        if all(rows.shape[1:]):
+            dist.all_to_all_single(received, sent, counts, list(sizes))
+        return received.to(rows.device), counts
+
+    def _counts(self, sizes: Sequence[int]) -> list[int]:
+        """How many rows each rank sends here, where this one sends `sizes`."""
+        sent = torch.tensor(sizes, dtype=torch.int64, device=self._place)
+        counts = torch.empty_like(sent)
+        dist.all_to_all_single(counts, sent)
+        return counts.tolist()

@@ -1,0 +1,104 @@
+"""A scene that convert.py made: its stages, the photos that it left out, and what has changed since."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from groundwork.files.json_files import read_json
+from groundwork.finding import Finding, fine, note
+from groundwork.host.listing import some
+from scene.readers.scene_folder import REPORT, WORK, find_capture
+
+REGISTERED = 0.9  # share of the photos that a good conversion places
+
+
+def state_of(path: Path) -> list[Any]:
+    """Describe a file, so that changes show: name, bytes, time of the last change."""
+    stat = path.stat()
+    return [path.name, stat.st_size, stat.st_mtime_ns]
+
+
+def stages_of(source: str | os.PathLike) -> dict[str, Any]:
+    """Return what the last conversion in a folder wrote of its stages, in stages.json; {}: nothing, or it is damaged.
+
+    Each has `done`, and `made_from`; the notes `options` and `files` have those of that conversion.
+    """
+    try:
+        return {name: dict(entry) for name, entry in read_json(Path(source) / WORK / "stages.json").items()}
+    except (OSError, ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def is_unfinished(source: str | os.PathLike) -> bool:
+    """Return True if a conversion was begun in a folder, and ended before its last stage."""
+    return bool(found := stages_of(source)) and not found.get("capture", {}).get("done")
+
+
+def changed_photos(source: str | os.PathLike) -> str | None:
+    """Say which photos of a scene that convert.py made are new, gone or changed since; None: none."""
+    stages, found = stages_of(source), find_capture(Path(source))
+    try:
+        before = dict(stages["files"]["made_from"])
+        ignored = set(read_json(Path(source) / REPORT)["unused"])
+    except (OSError, LookupError, TypeError, ValueError):
+        return None
+    paths = {name: path for name in before for path in (Path(source, name), found.place / name) if path.is_file()}
+    there = {name: state_of(path) for name, path in paths.items()}
+    if not there or is_unfinished(source):
+        return None
+    changed = [name for name, state in there.items() if state != before[name]]
+    if len(changed) == len(there) and all(state[:2] == before[name][:2] for name, state in there.items()):
+        changed = []  # the folder is a copy
+    now = {path.relative_to(found.place).as_posix() for path in found.photos}
+    kinds = {"new": now - set(before) - ignored, "gone": set(before) - set(there), "changed": changed}
+    said = [f"{len(names)} {kind} ({some(sorted(names))})" for kind, names in kinds.items() if names]
+    text = f"photos have changed since this scene was converted: {', '.join(said)}; to take this over, run convert.py "
+    return f"{text}again, with the options that it had" if said else None
+
+
+def left_out(source: str | os.PathLike) -> str | None:
+    """What convert.py could not place of the photos of a scene that it made; None: nothing, or another made it."""
+    try:
+        report = read_json(Path(source) / REPORT)
+        placed, count = int(report["registered"]), int(report["photos"])
+        if text := report.get("unusable"):
+            return f"convert.py says of this scene: {text}"
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    share = f"{placed} of {count} photos ({placed / max(count, 1):.0%})"
+    return f"this scene has {share} of its capture; capture.html in it says what is missing" if placed < count else None
+
+
+def already_undistorted(source: str | os.PathLike) -> bool:
+    """Whether convert.py made a scene of undistorted photos."""
+    try:
+        return read_json(Path(source) / REPORT)["lenses"] == "undistort"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def check_conversion(source: str | os.PathLike) -> Iterator[Finding]:
+    """How many photos convert.py has placed, if it made the scene."""
+    path = Path(source) / REPORT
+    if is_unfinished(source):
+        yield Finding("a conversion of this scene was not finished", "train.py finishes it, or run convert.py again")
+    if text := changed_photos(source):
+        yield note(text)
+    if not path.is_file():
+        return
+    try:
+        report = read_json(path)
+        placed, photos = int(report["registered"]), int(report["photos"])
+        advice = [str(line) for line in report["advice"]]
+        verdict = report.get("unusable")
+    except (OSError, ValueError, KeyError, TypeError):
+        yield Finding(f"{path} is damaged", "remove it, or run convert.py again")
+        return
+    if verdict:
+        yield Finding(f"convert.py says of this scene: {verdict}", "do what its page advises, and convert again")
+        return
+    text = f"{placed} of {photos} photos were placed by convert.py"
+    remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"
+    few = photos and placed / photos < REGISTERED
+    yield Finding(f"only {text}", remedy) if few else fine(text)

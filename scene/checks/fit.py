@@ -1,0 +1,131 @@
+"""Faults of lenses, units and poses that the tracks of structure from motion show."""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from groundwork.finding import Finding, fine, from_error
+from scene.dataset_readers import CameraInfo, SceneInfo
+from scene.readers.tracks import Track, rays_to, read_tracks
+from scene.reprojection import BOUND, nearest_pose, pull
+from splatting.registry import tools
+from utils.graphics_utils import world_to_camera
+from utils.system_utils import UserError
+
+COMPARED = 16  # views whose tracks are looked at
+UNITS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
+_ADJUSTED = 0.5  # median error of points with better poses, as a part of that with the given ones,
+_SEEN = 0.2  # if that is more pixels
+_MOST = 0.75  # share of the views that another cause makes better
+_LONGER = 0.03  # difference of a focal length that counts; tracks tell a hundredth of it
+_AGREEING = 0.9  # share of the photos
+_BENT = 2.0  # times the error of pairs alone, that a model's poses may have
+_WRONG = 5.0  # pixels, beyond which poses are wrong even if no better ones are near
+_ADJUST = "adjust the model again (COLMAP: bundle_adjuster)"
+
+
+def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
+    """Compare lenses with the tracks, then poses, as wrong lenses would look like wrong poses."""
+    views = info.train_cameras
+    try:
+        tracks = read_tracks(source, views, info.offset)
+    except UserError as error:
+        yield from_error(error)
+        return
+    yield from [*check_focal(views, tracks)] or check_poses(views, tracks, info.extent)
+
+
+def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> Iterator[Finding]:
+    """Another focal length, or another unit of the points, with which the tracks fit far better."""
+    step = max(1, len(views) // COMPARED)
+    pairs = [pair for pair in zip(views[::step], tracks[::step], strict=True) if pair[1] is not None]
+    if not pairs:
+        return
+    given = np.array([_missed(view, track) for view, track in pairs])
+    units = {k: np.array([_missed(*pair, unit=k) for pair in pairs]) for k in UNITS}
+    unit = min(units, key=lambda k: np.median(units[k]))
+    # The rays are those of the given focal length, so that they are too short where that is too long.
+    factor = float(np.median([_longer(*pair) for pair in pairs]))
+    longer = np.array([_missed(*pair, factor=factor) for pair in pairs])
+    best = units[unit] if np.median(units[unit]) < np.median(longer) else longer
+    if (best < _ADJUSTED * given).mean() < _MOST:
+        return
+    if best is longer and abs(factor - 1) > _LONGER:
+        text = f"points fit the photos with focal lengths {factor:.3g} times as long as the given ones"
+        yield Finding(text, "check the focal lengths and the size of the photos that they belong to")
+    elif best is not longer:
+        text = f"points fit the photos if those are scaled by {unit:g}: cameras and points have different units"
+        yield Finding(text, f"scale the points by {unit:g}")
+
+
+def _longer(view: CameraInfo, track: Track) -> float:
+    """The focal length that fits a track best, by the given one."""
+    places = np.nan_to_num(rays_to(track.points @ view.R + view.T, track.angular))
+    return float(np.median((track.rays * places).sum(axis=1) / np.maximum((places**2).sum(axis=1), 1e-9)))
+
+
+def _missed(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1.0) -> float:
+    """Median distance of points from their rays, in parts of the focal length."""
+    places = rays_to(unit * track.points @ view.R + view.T, track.angular)
+    away = np.linalg.norm(track.rays - factor * places, axis=1)
+    return float(np.median(np.where(np.isnan(away), np.inf, away)))
+
+
+def pose_errors(
+    views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float
+) -> tuple[float, float] | None:
+    """Pixels from points to where photos show them (median), with their poses and with the best ones; None: no tracks.
+
+    Of COMPARED views.
+    """
+    errors, step = [], max(1, len(views) // COMPARED)
+    for view, track in zip(views[::step], tracks[::step], strict=True):
+        if track is None:
+            continue
+        given = world_to_camera(view.R, view.T)
+        best = nearest_pose(given, track, view.fx, extent, BOUND)
+        errors.append([np.median(pull(pose, track, view.fx, extent).size) for pose in (given, best)])
+    return tuple(np.median(errors, axis=0).tolist()) if errors else None
+
+
+def poses_differ(given: float, best: float) -> bool:
+    """Whether better poses fit the tracks far better (`pose_errors`)."""
+    return given > _SEEN and best < _ADJUSTED * given
+
+
+def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float) -> Iterator[Finding]:
+    """Tracks that other poses fit far better than the given ones, as after a bundle adjustment they cannot."""
+    found = pose_errors(views, tracks, extent)
+    if found is None:
+        return
+    given, best = found
+    text = f"points lie {given:.2g} pixels from where photos show them (median)"
+    if poses_differ(given, best):
+        remedies = [*(remedy(True) for remedy in tools("for_wrong_poses")), _ADJUST]
+        yield Finding(f"{text}, and {best:.2g} with better poses", ", or ".join(remedies))
+    elif given > _WRONG:
+        yield Finding(text, "; ".join([_ADJUST, *(remedy(False) for remedy in tools("for_wrong_poses"))]))
+
+
+def check_agreement(folder: Path) -> Iterator[Finding]:
+    """Photos of a COLMAP model whose tracks contradict each other, as where a part of it is in a wrong place."""
+    import pycolmap
+
+    from scene.agreement import FLOOR, pairs_by_tracks, verdict
+
+    try:
+        pairs = list(pairs_by_tracks(pycolmap.Reconstruction(str(folder))))
+    except (ValueError, RuntimeError, IndexError, OSError):
+        return  # no model of COLMAP's; the readers have said what is wrong with one
+    if not pairs:
+        return
+    photos = len({name for pair in pairs for name in (pair.first, pair.second)})
+    found, side = verdict(pairs), max(pair.side for pair in pairs)
+    text = f"the tracks of {found['agreeing']} of {photos} photos agree with each other"
+    bent = found["error"] > max(_BENT * found["own_error"], FLOOR * side)
+    if bent or found["agreeing"] < _AGREEING * photos:
+        errors = f"{found['error']:.2g} pixels by the poses and {found['own_error']:.2g} by pairs alone"
+        yield Finding(f"only {text} (errors of {errors})", "compute the poses again, with convert.py or more photos")
+    else:
+        yield fine(text)

@@ -1,0 +1,95 @@
+"""Agreement of the processes of a training: before it begins, and in each iteration."""
+
+import argparse
+import hashlib
+import importlib.util
+from collections.abc import Sequence
+from pathlib import Path
+
+from groundwork.host.interrupt import DeferredInterrupt, Terminated
+from groundwork.ranks.ranks import Ranks, ranks, refuse_differences
+from scene.cameras import Camera
+from scene.gaussians.adam import StepGuard
+from scene.scene import Scene
+from splatting.iteration import Iteration, Losses
+from splatting.part import Part
+
+_ROOT = Path(__file__).resolve().parents[1]
+_ROOMS = ("arguments", "gaussian_renderer", "splatting", "scene", "utils")
+_EXTENSIONS = ("diff_gaussian_rasterization", "simple_knn", "fused_ssim")
+
+
+def agree_on_options(args: argparse.Namespace) -> None:
+    """UserError if ranks have other code or options than rank 0."""
+    if not ranks().several:
+        return
+    refuse_differences(ranks().everyone(_code()), "give all ranks the same files", shown=False)
+    options = {f"--{name}": str(value) for name, value in vars(args).items()}
+    refuse_differences(ranks().everyone(options), "start all ranks with the same command")
+
+
+def agree_on_scene(scene: Scene, start: str | None) -> None:
+    """UserError if ranks have read another scene or checkpoint (start: the one resumed) than rank 0."""
+    if not ranks().several:
+        return
+    facts = {"the training views": _digest(scene.getTrainCameras()), "the test views": _digest(scene.getTestCameras())}
+    if start:
+        facts[start] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
+    refuse_differences(ranks().everyone(facts), "give all ranks the same dataset", shown=False)
+
+
+def _code() -> dict[str, str]:
+    """Digests of the Python files that take part, by path, and of the extensions' binaries, by name."""
+    paths = [_ROOT / "train.py", *(path for room in _ROOMS for path in (_ROOT / room).rglob("*.py"))]
+    found = {str(path.relative_to(_ROOT)): path for path in sorted(paths)}
+    for name in _EXTENSIONS:
+        module = importlib.util.find_spec(name)
+        if module is not None and module.origin is not None:
+            found |= {f"{name}/{path.name}": path for path in sorted(Path(module.origin).parent.glob("*.so"))}
+    return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()}
+
+
+def _digest(cameras: Sequence[Camera]) -> str:
+    """Digest of names, sizes, matrices, and kinds of image files (photo, mask, depth map)."""
+    digest = hashlib.sha256()
+    for camera in cameras:
+        kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "undecoded", ())]
+        size = camera.image_width, camera.image_height
+        digest.update(f"{camera.image_name} {size} {kinds} {getattr(camera, 'lens', None)}\n".encode())
+        digest.update(camera.full_proj_transform.cpu().numpy().tobytes())
+    return digest.hexdigest()
+
+
+_SIGNALS = (None, KeyboardInterrupt, Terminated)
+
+
+class StepAgreement(Part):
+    """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
+
+    These go with the numbers that they exchange to render the iteration's view (`agree`), and are known when its
+    losses are. A signal counts for the iteration that begins after it, on all, whichever has got it.
+    """
+
+    def __init__(self, group: Ranks, interrupt: DeferredInterrupt, guard: StepGuard | None) -> None:
+        """interrupt: of this process. guard: that of its optimisers, if they have one."""
+        self._group, self._interrupt = group, interrupt
+        if group.several:
+            group.flag = None if guard is None else guard.stopped
+        self._asked: type[KeyboardInterrupt] | None = None
+
+    def begins(self, at: Iteration) -> None:
+        self._group.post(int(at.due), _SIGNALS.index(self._interrupt.requested))
+
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        due, signal = self._group.heard()
+        at.due = bool(due)
+        self._asked = _SIGNALS[signal]
+
+    @property
+    def stopping(self) -> type[KeyboardInterrupt] | None:
+        """What asks to stop after this iteration."""
+        return self._asked if self._group.several else self._interrupt.requested
+
+    def wait(self) -> None:
+        """Wait until the first has written what it writes: torchrun ends all once one has ended."""
+        self._group.anyone(False)

@@ -1,0 +1,293 @@
+"""Render a trained model's train and test views as PNG beside the ground truth, and time the renders.
+
+python render.py -m MODEL [--iteration N] [--skip_train] [--skip_test] [--depth] [--alpha]
+python render.py -m MODEL --path {interpolate,ellipse,spiral,FILE.json} [--fps N] [--size W H] [--seconds S] [--frames]
+python render.py -m MODEL --path top [--size W H]
+python render.py -s SCENE -m OUT --ply FILE
+
+Writes MODEL/{train,test}/ours_N/{renders,gt}/00000.png ..., numbered by the views' sorted order, masks/ for views of
+which not every pixel counts, and render_times.json beside these folders: the time of each view without I/O. The device
+is idle before the clock starts, and done when it stops. --depth and --alpha write inverse depth and alpha into folders
+of these names, 16-bit PNGs with their scale in a text chunk (groundwork/files/image_files.py). Of COLMAP scenes,
+--depth also writes depth_errors.json, the errors at points that no training was supervised by, for metrics.py.
+
+With --path, writes MODEL/videos/ours_N/NAME.mp4 instead (gaussian_renderer/camera_paths/render_path.py), or top.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import shutil
+import sys
+import time
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
+import numpy as np
+import torch
+from PIL import Image
+
+from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
+from gaussian_renderer.blending import PLANES, view_planes
+from gaussian_renderer.camera_paths.render_path import add_path_options, path_request, render_path
+from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer.rays import check_views
+from gaussian_renderer.scored_views import ScoredViews, beside_test
+from groundwork.files.image_files import open_image, remove_leftovers, save_png, write_plane
+from groundwork.files.json_files import write_json
+from groundwork.host.progress import Bar
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.point_depths import PointDepths, held_out_points
+from scene.saved_model import load_saved
+from scene.scene import Scene
+from scene.with_splats import load_file
+from splatting.records.renders import BESIDE, DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
+from utils.general_utils import safe_state
+from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p
+
+if TYPE_CHECKING:
+    from gaussian_renderer.camera_paths.without_scene import WithoutScene
+
+_COMPARED, _FEWEST, _SMALL = 24, 6, (32, 32)  # most and fewest views that are compared, and their size in pixels
+_BETTER, _FITTING = 0.9, 0.75  # shares: of other photos that are less like a render than its own, and of such renders
+
+
+def write_views(
+    folder: Path,
+    views: list[Camera],
+    gaussians: GaussianModel,
+    pipe: argparse.Namespace,
+    background: torch.Tensor,
+    train_test_exp: bool = False,
+    planes: Collection[str] = (),
+    points: Mapping[str, PointDepths] | None = None,
+    scored: ScoredViews | None = None,
+) -> list[float]:
+    """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
+
+    train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too. points:
+    score the depth, by image name. scored: how to render and score them, None: by the options.
+    """
+    scored = scored or ScoredViews(pipe, background, train_test_exp)
+    for side in ("renders", "gt"):
+        if views:
+            mkdir_p(folder / side)
+            (folder / INCOMPLETE).touch()
+        remove_leftovers(folder / side, len(views))
+    remove_leftovers(folder / "masks", 0)  # some views may have none
+    shutil.rmtree(folder / ERRORS, ignore_errors=True)
+    for plane in PLANES:
+        remove_leftovers(folder / plane, len(views) if plane in planes else 0)
+    seconds, errors = [], {}
+    for view in {(view.image_width, view.image_height): view for view in views}.values():
+        # The first call of a size also pays for allocations and caches.
+        scored.whole(view, gaussians)
+    for index, view in enumerate(Bar(views, desc=f"Rendering {folder.parent.name}", unit="view", disable=not views)):
+        _wait(background.device)
+        start = time.perf_counter()
+        image = scored.whole(view, gaussians)
+        _wait(background.device)
+        seconds.append(time.perf_counter() - start)
+        save_png(scored.part(image), folder / "renders" / f"{index:05d}.png")
+        save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
+        for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
+            if plane in planes:
+                path = folder / plane / f"{index:05d}.png"
+                write_plane(path, scored.part(values)[0].cpu().numpy(), PLANES[plane].white)
+            if plane == "depth" and points and view.image_name in points:
+                errors[f"{index:05d}.png"] = points[view.image_name].scores(values, view.counted_pixels)
+        if (mask := scored.mask(view)) is not None:  # white where pixels count
+            with atomic_write(folder / "masks" / f"{index:05d}.png") as temporary:
+                Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
+    if errors:
+        write_json(folder / DEPTHS, errors)
+    (folder / INCOMPLETE).unlink(missing_ok=True)
+    return seconds
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+@torch.no_grad()
+def render_set(
+    model_path: str | Path,
+    name: str,
+    iteration: int,
+    views: list[Camera],
+    gaussians: GaussianModel,
+    pipeline: argparse.Namespace,
+    background: torch.Tensor,
+    train_test_exp: bool = False,
+    separate_sh: bool = False,
+    *,
+    planes: Collection[str] = (),
+    points: Mapping[str, PointDepths] | None = None,
+    scored: ScoredViews | None = None,
+) -> None:
+    """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; say how long.
+
+    train_test_exp: render with exposures, and write right halves only. separate_sh: accepted for callers of the
+    reference; the SH bands are always passed separately. planes, points, scored: as for `write_views`.
+    """
+    folder = Path(model_path) / name / f"ours_{iteration}"
+    for of_earlier in (TIMES, DEPTHS):  # of an interrupted run they do not count
+        (folder / of_earlier).unlink(missing_ok=True)
+    with memory_errors_explained(gaussians, views):
+        seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes, points, scored)
+    if not seconds:
+        print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
+        return
+    sizes = [(view.image_width, view.image_height) for view in views]
+    antialiasing = getattr(pipeline, "antialiasing", False)  # options of 2023 lack it
+    times = summarise_times(seconds, sizes, len(gaussians), antialiasing, background.device)
+    times["model_sha256"] = model_digest(Path(model_path), str(iteration))
+    write_json(folder / TIMES, times)
+    median = f"median {times['median_ms']:.2f} ms a view ({times['fps']:.1f} frames per second)"
+    print(f"{name}: {len(views)} views, {median}")
+
+
+@torch.no_grad()
+def render_sets(
+    dataset: argparse.Namespace,
+    iteration: int,
+    pipeline: argparse.Namespace,
+    skip_train: bool,
+    skip_test: bool,
+    separate_sh: bool = False,
+    *,
+    sh_degree: int | None = None,
+    planes: Collection[str] = (),
+    ply: str = "",
+) -> None:
+    """Render the views of a saved iteration, -1: the last one, by `render_set`.
+
+    Folders of pictures that options draw or compare in another way than the model's have names that say so, as in
+    ours_30000_r2. Test views are also rendered as parts score them besides, as ours_N_fitted_appearance.
+    dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
+    too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
+    """
+    scene, background = _loaded(dataset, iteration, sh_degree, ply, pipeline)
+    drawn = scene.gaussians, pipeline, background, scene.halves, separate_sh
+    if not skip_train:
+        render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
+    if not skip_test:
+        views = scene.getTestCameras()
+        points = held_out_points(scene, dataset.source_path) if "depth" in planes else None
+        render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
+        beside = beside_test(scene, pipeline, background)
+        for name in BESIDE:
+            scored, shown = beside.get(name, (None, []))
+            method = f"{scene.loaded_iter}_{name}"
+            if shown:
+                render_set(scene.model_path, "test", method, shown, *drawn, planes=planes, scored=scored)
+            else:
+                shutil.rmtree(Path(scene.model_path) / "test" / f"ours_{method}", ignore_errors=True)
+    if ply and not (skip_train and skip_test):
+        folder = Path(scene.model_path) / ("test" if skip_train else "train") / f"ours_{scene.loaded_iter}"
+        warn_if_elsewhere(ply, folder)
+
+
+def _loaded(
+    dataset: argparse.Namespace,
+    iteration: int,
+    sh_degree: int | None,
+    ply: str,
+    pipeline: argparse.Namespace,
+    load: Callable[..., Scene | WithoutScene] = load_saved,
+) -> tuple[Scene | WithoutScene, torch.Tensor]:
+    """The scene with the model of a saved iteration, or that of the file `ply`, and the background (3,).
+
+    load: loads a saved iteration; `saved_scene` also without the scene.
+    """
+    options = copy.copy(dataset)
+    options.images_to_load = 1  # each photo is used once
+    scene = load_file(options, ply, pipeline) if ply else load(options, iteration, sh_degree)
+    if not ply and getattr(dataset, "other_scene", ""):
+        scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
+    scene.loaded_iter = f"{scene.loaded_iter}{dataset.marks}" if getattr(dataset, "marks", "") else scene.loaded_iter
+    if len(scene.gaussians) == 0:
+        raise UserError(f"iteration {scene.loaded_iter} of {scene.model_path} has no Gaussians; train it again")
+    views = *scene.getTrainCameras(), *scene.getTestCameras()
+    check_views(pipeline, views)
+    if not (ply or getattr(dataset, "other_scene", "")):
+        from gaussian_renderer.camera_paths.without_scene import warn_if_moved  # SciPy takes a while to import
+
+        warn_if_moved(scene.model_path, views)
+    return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
+
+
+def _small(path: Path) -> np.ndarray:
+    """Read a picture at _SMALL, as (h, w, 3) float64 of 255."""
+    with open_image(path) as image:
+        return np.asarray(image.convert("RGB").resize(_SMALL), float)
+
+
+def warn_if_elsewhere(model: str, folder: Path) -> None:
+    """Warn if most renders of a set are no more like their own photo than like the photos of other views."""
+    names = sorted(path.name for path in (folder / "renders").glob("*.png"))
+    if len(names) < _FEWEST:
+        return
+    names = names[:: -(-len(names) // _COMPARED)]
+    renders, photos = (np.stack([_small(folder / side / name) for name in names]) for side in ("renders", "gt"))
+    errors = np.abs(renders[:, None] - photos).mean(axis=(2, 3, 4))
+    fit = (errors.diagonal()[:, None] < errors).sum(axis=1) >= _BETTER * (len(names) - 1)
+    if fit.mean() < _FITTING:
+        text = f"{(~fit).sum()} of {len(fit)} renders are no more like their own photo than like others"
+        print(
+            f"warning: {model} may not be where the cameras are, as after a program has turned, moved or scaled it: "
+            f"{text}; export it again in the cameras' frame",
+            file=sys.stderr,
+        )
+
+
+def main() -> None:
+    parser = OptionParser(description="Render the train and test views of a trained model, or a video of it.")
+    # Each photo is used once, so one is kept in memory.
+    model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
+    pipeline_params = PipelineParams(parser, sentinel=True)
+    parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (default: -1, the last)")
+    parser.add_argument("--ply", default="", metavar="FILE",
+        help="render this model of any tool in the views of -s, as -m has none of its own (default: none)")  # fmt: skip
+    parser.add_argument("--skip_train", action="store_true", help="leave the training views out (default: off)")
+    parser.add_argument("--skip_test", action="store_true", help="leave the test views out (default: off)")
+    for name, plane in PLANES.items():
+        help_text = f"also write {plane.what}, 16-bit PNGs (default: off)"
+        parser.add_argument(f"--{name}", action="store_true", help=help_text)
+    other = "render views of another scene than the model's, into folders with its name (default: refuse)"
+    parser.add_argument("--allow_other_scene", action="store_true", help=other)
+    add_path_options(parser)
+    parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
+    args = get_combined_args(parser)
+    options, pipeline = model_params.extract(args), pipeline_params.extract(args)
+    options.other_scene, options.marks = args.other_scene, args.marks
+    safe_state(args.quiet)
+    if args.other_scene and not (args.allow_other_scene or args.ply):
+        trained = read_cfg_args(args.model_path)["source_path"]
+        raise UserError(
+            f"{args.model_path} is a model of another scene, {trained}; leave -s out, or give --allow_other_scene"
+        )
+    warn_of_background(options)
+    request = path_request(args)
+    if request:
+        from gaussian_renderer.camera_paths.without_scene import saved_scene  # as above
+
+        scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
+        if request.make is None:
+            from gaussian_renderer.camera_paths.from_above import render_top  # as above
+
+            render_top(scene, options.source_path, pipeline, background, request.size)
+        else:
+            render_path(scene, pipeline, background, request)
+        return
+    chosen = {
+        "sh_degree": args.typed_sh_degree,
+        "ply": args.ply,
+        "planes": [plane for plane in PLANES if getattr(args, plane)],
+    }
+    render_sets(options, args.iteration, pipeline, args.skip_train, args.skip_test, **chosen)

@@ -1,0 +1,103 @@
+"""What a training writes for TensorBoard. The tags are the reference's."""
+
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene.cameras import Camera
+    from scene.gaussian_model import GaussianModel
+
+INTERVAL = 10  # iterations between losses: reading one waits for the GPU
+_FLUSHED = 10  # seconds until events are in the file at the latest
+
+
+class Events:
+    """Writes events of one iteration by a SummaryWriter."""
+
+    def __init__(self, writer: Any, iteration: int) -> None:
+        self._writer = writer
+        self._iteration = iteration
+
+    def losses(self, l1: "Tensor", total: "Tensor", seconds: float) -> None:
+        """Of every tenth iteration, and the seconds that it took."""
+        if self._iteration % INTERVAL == 0:
+            self._scalar("train_loss_patches/l1_loss", l1.item())
+            self._scalar("train_loss_patches/total_loss", total.item())
+            self._scalar("iter_time", seconds * 1000.0)
+
+    def image(self, views: str, camera: "Camera", what: str, image: "Tensor") -> None:
+        """An image (3, H, W) of a view. views: the name of its set."""
+        self._writer.add_image(f"{views}_view_{camera.image_name}/{what}", image, global_step=self._iteration)
+
+    def scores(self, views: str, means: Mapping[str, float]) -> None:
+        """Mean scores of a set of views: l1 and psnr."""
+        for kind, value in means.items():
+            self._scalar(f"{views}/loss_viewpoint - {kind.replace('l1', 'l1_loss')}", value)
+
+    def model(self, gaussians: "GaussianModel") -> None:
+        """Its opacities, and how many Gaussians it has."""
+        self._writer.add_histogram("scene/opacity_histogram", gaussians.get_opacity, self._iteration)
+        self._scalar("total_points", len(gaussians))
+
+    def _scalar(self, tag: str, value: float) -> None:
+        self._writer.add_scalar(tag, value, self._iteration)
+
+
+class EventWriter:
+    """A SummaryWriter of torch, all of whose methods can be called. ImportError without TensorBoard.
+
+    If one fails, as on a full disk, one warning says so, and nothing more is written.
+    """
+
+    def __init__(self, log_dir: str) -> None:
+        from torch.utils.tensorboard import SummaryWriter  # takes 0.3 s to import
+
+        self._folder, self._failed = log_dir, False
+        self._writer = self._guarded(SummaryWriter, log_dir, flush_secs=_FLUSHED)
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return partial(self._guarded, getattr(self._writer, name, None))
+
+    def add_image(self, tag: str, image: "Tensor", global_step: int) -> None:
+        """Add an image (3, H, W), from 0 to 1, as a JPEG: a training took 8 s for PNGs and their checksums."""
+        self._guarded(self._add_jpeg, tag, image, global_step)
+
+    def _add_jpeg(self, tag: str, image: "Tensor", step: int) -> None:
+        from PIL import Image
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        from groundwork.files.image_files import to_bytes
+
+        jpeg, pixels = BytesIO(), to_bytes(image).numpy()
+        Image.fromarray(pixels).save(jpeg, "JPEG", quality=90)
+        height, width, _ = pixels.shape
+        picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=jpeg.getvalue())
+        self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
+
+    def _guarded(self, method: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        from tqdm import tqdm
+
+        if self._failed:
+            return None
+        try:
+            return method(*given, **named)
+        except Exception as error:  # whatever it is, the training goes on
+            self._failed = True
+            fault = f"cannot write TensorBoard's events into {self._folder} ({error})"
+            tqdm.write(f"warning: {fault}; training continues without them", file=sys.stderr)
+            return None
+
+
+def summary_writer(folder: str) -> Any | None:
+    """A SummaryWriter of torch; None without TensorBoard."""
+    try:
+        return EventWriter(folder)
+    except ImportError:
+        return None  # doctor.py says so

@@ -1,0 +1,151 @@
+"""The captured step: a fused step that is one launch, taken by a host that runs ahead of its GPU.
+
+A step has some fifty launches, which cost the host more than the GPU computes for, and the GPU a gap each. So most are
+graphs (training/steps/graphs.py). All else is the code of training/steps/fused.py, and the kernels are the same, so the
+bytes are those of any other way to take the step.
+"""
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from scene.fused_adam import CAMERA_NUMBERS
+from splatting.faster.faster import Tell
+from splatting.faster.fused import FusedStep
+from splatting.faster.graphs import ROWS, Graphs
+from splatting.faster.speculative import AHEAD, Speculation
+from splatting.iteration import Iteration, Losses
+from splatting.run import Run
+
+
+class CapturedStep(FusedStep):
+    """Takes steps as `FusedStep` does, but does not wait for the GPU unless something reads or changes the model."""
+
+    def __init__(self, run: Run) -> None:
+        super().__init__(run)
+        self._ahead = Speculation(run.device, self)
+        self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
+        pinned = run.device.type == "cuda"
+        self._rows = (
+            torch.zeros(ROWS, CAMERA_NUMBERS, dtype=torch.float64, pin_memory=pinned) if run.camera_steps else None
+        )
+        self._fetched: dict[int, _Fetched] = {}  # by iteration: of cameras that have yet to step
+
+    def take(self, at: Iteration, tell: Tell) -> bool:
+        """Queue a step, unless something is due in it."""
+        run = self._run
+        if not self._is_queued(at):
+            self.drain()  # nothing is pending, unless --debug_from has just come into force
+            run.set_rates(at)
+            return super().take(at, tell)
+        losses = self._queue(at)
+        if losses is None:
+            self._ahead.discard()
+            self._step_on_host(0)
+            run.set_rates(at)
+            return False
+        self._ahead.add(at, losses)
+        tell.measured(at, losses)
+        return True
+
+    def throttle(self, at: Iteration) -> None:
+        if self._is_queued(at):
+            self._ahead.throttle()
+            if host := self._run.camera_steps:
+                most = host.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
+                self._ahead.wait(most)
+                self._step_on_host(min(most, AHEAD))
+        else:
+            self.drain()
+            self._graphs.save_memory()
+
+    def drain(self) -> None:
+        self._ahead.drain()
+        self._step_on_host(0)
+        if self._run.camera_steps:
+            self._run.camera_steps.place()
+
+    def abort(self) -> None:
+        self._ahead.abort()
+
+    def _is_queued(self, at: Iteration) -> bool:
+        return at.steps and not at.due and self._fuses(at)
+
+    def _knows_model(self) -> bool:
+        knows = super()._knows_model()
+        if knows:
+            self._graphs.check()
+        return knows
+
+    def _queue(self, at: Iteration) -> Losses | None:
+        """Queue a step. Returns its losses, or None if these have further terms."""
+        run, strategy = self._run, self._run.strategy
+        losses = self._graphs.launch(at)
+        if losses is not None:
+            self._fetch(at)
+            flushes = run.sleeping is not None and run.sleeping.flushes(at.iteration)
+            queues = strategy.queues or run.gaussians.exposures.applied or flushes
+            with self._ahead.capacity(at) if queues else nullcontext():
+                run.gaussians.exposures.step()
+                run.after_step(at)
+            return losses
+        with self._ahead.capacity(at):
+            drawn, losses, gradients = self.measure(at)
+            if self.drops_parameter_terms():
+                return None
+            run.gaussians.guard_loss(at.iteration, losses.total)
+            self.advance(at, drawn, gradients)
+            self._fetch(at)
+            self.follow(at)
+        return losses
+
+    def _fetch(self, at: Iteration) -> None:
+        """Queue a copy to the host of the gradient of the view's camera."""
+        if self._rows is None:
+            return
+        row = self._rows[at.iteration % ROWS]
+        row.copy_(self.camera_gradient, non_blocking=True)
+        copied = torch.cuda.current_stream().record_event() if row.is_pinned() else None
+        self._fetched[at.iteration] = _Fetched(at.camera.uid, row, copied)
+
+    def _step_on_host(self, most: int) -> None:
+        """Take the steps of cameras that steps of the Gaussians left behind, but at most so many of the last.
+
+        They wait as long as they may: to wait for a step's end here would let the GPU run out of work.
+        """
+        while len(self._fetched) > most:
+            iteration = next(iter(self._fetched))
+            fetched = self._fetched.pop(iteration)
+            if fetched.copied is not None:
+                fetched.copied.synchronize()
+            step = self._run.schedule.schedule_step(iteration)
+            self._run.camera_steps.step(fetched.uid, fetched.gradient.numpy(), step)
+
+    # What speculation asks for, of steps that are done or overflowed
+
+    def replay(self, at: Iteration, first: Losses) -> None:
+        """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
+        self._run.set_rates(at)
+        losses = self._queue(at)
+        with torch.no_grad():
+            # One of them may be of a graph, which tells of no terms.
+            terms = losses.terms.keys() & first.terms.keys()
+            pairs = [(losses.total, first.total), (losses.l1, first.l1)]
+            for new, old in pairs + [(losses.terms[name], first.terms[name]) for name in terms]:
+                old.detach().copy_(new)
+
+    def rewind(self, steps: int) -> None:
+        """Take back what the host has counted for steps that will be replayed."""
+        self._run.gaussians.rewind(steps)
+        if steps and self._run.sleeping:
+            self._run.sleeping.stepped()  # a rest may be among the steps
+        self._graphs.clear()
+
+
+@dataclass
+class _Fetched:
+    uid: int
+    gradient: Tensor  # (CAMERA_NUMBERS,) on the host, once it is copied
+    copied: torch.cuda.Event | None

@@ -1,0 +1,146 @@
+"""Growth to a given number of Gaussians, where the training views' error is.
+
+After the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and the
+long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even, which was
+no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight over several
+views, and nothing else counts. Gaussians are drawn by their scores without replacement, not the highest taken. Children
+keep their parent's mean and covariance. Opacities are multiplied by a factor, where Rota Bulo et al. subtract a
+constant. Adam averages squared gradients over fewer iterations, and SH bands learn faster from many photos.
+"""
+
+import math
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from splatting.option import Option, within
+from splatting.part import Options, Strategy
+from splatting.schedule import longer_steps
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from scene.cameras import Camera
+    from splatting.iteration import Iteration
+
+SQUARES = 0.005  # 1 - beta2 of Adam in USUAL iterations; the paper has 0.001
+LEAST_AVERAGED = 16  # iterations, over which squared gradients are averaged in any case
+SCORED_VIEWS = 10  # at most, drawn anew in each densification
+ITERATIONS_A_SCORE = 5  # at least, of a scored view
+
+
+class Budget(Strategy):
+    """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
+
+    max_gaussians is their number at the end of that. In a given time it is best in most cases.
+    """
+
+    name = "budget"
+    summary = (
+        "grows to --max_num_splats Gaussians where the error is largest (0: one for 64 training pixels, 100,000 to "
+        "1,000,000)"
+    )
+    removes = True
+    fusable = True
+    clamps = False
+    # fmt: off
+    options = Options(optimisation=(
+        Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
+            help="budget: factor of all opacities after each densification, so that unneeded Gaussians fade; 1: off"),
+        Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
+            help="budget: remove Gaussians of a lower opacity, every --densification_interval steps"),
+    ))
+    # fmt: on
+
+    @classmethod
+    def best_in(cls, seconds: float, run: Any) -> bool:
+        return True
+
+    def begin(self, run: Any, state: Any) -> None:
+        from scene.gaussians.density_rules import band_rate, default_budget
+        from splatting.features.budget_rules import error_scores
+
+        super().begin(run, state)
+        self._gaussians, self._opt, self._cameras = run.gaussians, run.opt, run.scene.getTrainCameras()
+        self.ends = run.opt.densify_until_iter
+        self._scores = partial(error_scores, run.gaussians, run.pipe, run.gaussians.exposures.applied)
+        self.max_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
+        self.band_rate = band_rate(self._cameras)
+
+    def rate_factor(self, iteration: int) -> float:
+        """Learning rates follow the number of iterations, and fall at the end."""
+        return longer_steps(self.schedule.usual_stride(iteration), iteration / self.schedule.length)
+
+    def beta2(self, iteration: int) -> float:
+        """Fewer iterations average over fewer of them, by the root of their number as their steps are longer."""
+        return 1.0 - min(SQUARES * math.sqrt(self.schedule.usual_stride(iteration)), 1 / LEAST_AVERAGED)
+
+    def changes(self, iteration: int) -> bool:
+        in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter
+        return in_time and iteration % self._interval(iteration) == 0
+
+    def after_step(self, at: "Iteration") -> None:
+        if not self.changes(at.iteration):
+            return
+        from scene.gaussians.adc import refuse_empty, remove_useless
+        from scene.gaussians.morton import sort_rows
+        from splatting.features.budget_rules import fade, split_in_two
+
+        grows = self._grows(at.iteration)
+        aim = now = self._gaussians.gaussian_count
+        if grows:
+            aim = self._aim(now, at.iteration)
+        remove_useless(self._gaussians, self._opt.prune_opacity, max(aim, 1))
+        refuse_empty(at.iteration, self._gaussians.gaussian_count == 0, "lower --prune_opacity")
+        if grows:
+            if aim > self._gaussians.gaussian_count:
+                split_in_two(self._gaussians, self._chosen(at, aim - self._gaussians.gaussian_count))
+            fade(self._gaussians, self._opt.opacity_decay)
+        sort_rows(self._gaussians)
+
+    def projected_count(self, count: int, first: int, last: int) -> int:
+        for iteration in filter(self.changes, range(first, min(last, self.ends))):  # the last iteration takes no step
+            if self._grows(iteration):
+                count = min(self._aim(count, iteration), 2 * count)
+        return count
+
+    def _aim(self, now: int, iteration: int) -> int:
+        """How many Gaussians there are to be after the densification of an iteration, `now` before it.
+
+        They approach the most in equal parts. This needs no state, and a run that fell behind catches up.
+        """
+        most = self.schedule.count_limit(iteration, now, self.max_gaussians, self.max_gaussians)
+        remaining = self._remaining(iteration)
+        return most - round((most - now) * (remaining / (remaining + 1)))
+
+    def _grows(self, iteration: int) -> bool:
+        return self.schedule.schedule_step(iteration) > self._opt.densify_from_iter
+
+    def _remaining(self, iteration: int) -> int:
+        """How many densifications follow that of this iteration, at its schedule."""
+        opt, stride = self._opt, self.schedule.stride(iteration)
+        ahead = (opt.densify_until_iter - self.schedule.schedule_step(iteration)) / (self._interval(iteration) * stride)
+        if stride != 1:
+            ahead -= 0.5  # the stride changes, so one that just comes in time may not come
+        return max(math.ceil(ahead) - 1, 0)
+
+    def _interval(self, iteration: int) -> int:
+        from scene.gaussians.density_rules import interval
+
+        return interval(self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration))
+
+    def _chosen(self, at: "Iteration", count: int) -> "Tensor":
+        """Indices of this process's Gaussians to split, ascending; those of all processes are at most `count`."""
+        from groundwork.deterministic.counter_rng import Stream
+
+        scores = self._scores(self._scored_views(at.iteration), at.background)
+        numbers = {"seed": self._opt.seed, "stream": Stream.DENSIFY, "iteration": at.iteration}
+        return self._gaussians.shards.choose(scores, count, **numbers)
+
+    def _scored_views(self, iteration: int) -> "list[Camera]":
+        from groundwork.deterministic.counter_rng import Stream, permutation
+
+        order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
+        count = SCORED_VIEWS
+        if self.schedule.stride(iteration) > 1:  # few iterations, of which scores shall not take the time
+            count = min(count, max(self._interval(iteration) // ITERATIONS_A_SCORE, 1))
+        return [self._cameras[index] for index in order[:count]]

@@ -1,0 +1,172 @@
+"""Relocation and noise (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
+
+Gaussians are taken for samples of a distribution, and training for a random walk among them. What departs from the
+paper: opacities and scales are penalised by their means, as in the authors' release, where the paper writes sums;
+Adam's averages restart for the moved Gaussians as well as for those that they come to; a step and its penalties concern
+what the view sees; and SH bands learn faster from many photos.
+"""
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+from splatting.option import Option, at_least, within
+from splatting.part import Options, Strategy
+
+if TYPE_CHECKING:
+    from splatting.iteration import Iteration
+
+_PAPER = "ours, from the MCMC paper"
+_RELEASED = "ours, from the release of the MCMC paper"
+MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
+INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
+SECONDS = 0.25  # for each training photo, at least: 250 iterations on a GPU (docs/guide/strategies.md)
+
+
+def _between(value: float) -> str | None:
+    return None if 0 < value < 1 else "between 0 and 1, and neither of them"
+
+
+class Mcmc(Strategy):
+    """Moves Gaussians that nobody sees to others, by the rules beside it. It resets no opacities.
+
+    In a given time it is best for few photos, on a GPU.
+    """
+
+    name = "mcmc"
+    summary = "moves transparent Gaussians to opaque ones and adds noise to positions"
+    until = "mcmc_until_iter", 5 / 6
+    fusable = True
+    clamps = False
+    default_is_limit = True
+    queues = True
+    seen_only = True
+    # fmt: off
+    options = Options(optimisation=(
+        Option("mcmc_until_iter", 25_000, origin=_RELEASED, check=at_least(0),
+            help="mcmc: relocation and growth end before this step; --densify_until_iter has no effect then"),
+        Option("mcmc_growth", 0.05, origin=_PAPER, check=within(0, 1),
+            help="mcmc: growth in every densification, as a part of the number of Gaussians"),
+        Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_between,
+            help="mcmc: a Gaussian of this opacity or less is moved to another one"),
+        Option("mcmc_noise", 500_000.0, origin=_PAPER, check=within(0, 1e9),
+            help="mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions"),
+        Option("mcmc_opacity_reg", 0.01, origin=_PAPER, check=at_least(0),
+            help="mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved"),
+        Option("mcmc_scale_reg", 0.01, origin=_PAPER, check=at_least(0),
+            help="mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians"),
+        Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_between,
+            help="mcmc: opacity of the Gaussians that are made from points"),
+        Option("mcmc_init_scale", 0.0, origin=_RELEASED, check=at_least(0),
+            help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their "
+                 "neighbours; 0: 0.1, or 1 in a given time"),
+    ))
+    # fmt: on
+
+    @classmethod
+    def best_in(cls, seconds: float, run: Any) -> bool:
+        from scene.gaussians.density_rules import FEW_PHOTOS
+
+        views = run.scene.getTrainCameras()
+        few = len(views) <= FEW_PHOTOS and seconds >= SECONDS * len(views)
+        return few and run.device.type == "cuda"
+
+    def begin(self, run: Any, state: Any) -> None:
+        from scene.gaussians.density_rules import band_rate, default_budget
+        from scene.gaussians.penalty import Penalty
+
+        super().begin(run, state)
+        self._gaussians, opt = run.gaussians, run.opt
+        self._opt, self.ends = opt, opt.mcmc_until_iter
+        paced = run.schedule.paced
+        cameras = run.scene.getTrainCameras()
+        self.band_rate = band_rate(cameras)
+        default = default_budget(cameras) if paced else MOST_GAUSSIANS
+        self.max_gaussians = opt.max_num_splats or default
+        # Penalties need time; with little of it they only darken (fox_tiny, 1,243 iterations: -1.7 dB), except where
+        # they clear away random points (nerf_lego200_tiny, 346 iterations: +17 dB).
+        if not paced or self.best_in(run.schedule.seconds, run) or run.scene.info.ply_path is None:
+            # Of scales as they are drawn, so that it does not depend on the unit.
+            self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg * run.gaussians.enlargement)
+
+    def too_slow(self) -> str:
+        return f"--mcmc_growth {self._opt.mcmc_growth:g} adds too few each time; raise it"
+
+    def started(self) -> None:
+        """Make Gaussians more opaque and smaller than those of adaptive density control (as the authors' release)."""
+        from splatting.features.mcmc_rules import start_as
+
+        scale = self._opt.mcmc_init_scale or INIT_SCALES[self.schedule.paced]
+        start_as(self._gaussians, self._opt.mcmc_init_opacity, scale)
+
+    def changes(self, iteration: int) -> bool:
+        from scene.gaussians.density_rules import interval
+
+        opt = self._opt
+        within = opt.densify_from_iter < self.schedule.schedule_step(iteration) < opt.mcmc_until_iter
+        stride = self.schedule.stride(iteration)
+        return within and iteration % interval(opt, opt.mcmc_until_iter, stride) == 0
+
+    def projected_count(self, count: int, first: int, last: int) -> int:
+        # The last iteration is saved before its change.
+        for iteration in filter(self.changes, range(first, min(last, self.ends))):
+            count = max(count, self._grown(count, iteration))
+        return count
+
+    def skips_step(self, iteration: int) -> Collection[str]:
+        """All, unless there is nothing to do: then the Gaussians take their step."""
+        from splatting.features.mcmc_rules import is_alive
+
+        gaussians, least = self._gaussians, self._opt.mcmc_min_opacity
+        if not self.changes(iteration):
+            return ()
+        count = gaussians.gaussian_count
+        moves = 0 < self._limit(iteration, count, 0) < count or self._grown(count, iteration) > count
+        moves = moves or gaussians.shards.ranks.anyone(not is_alive(gaussians, least).all())
+        return gaussians._attributes if moves else ()
+
+    def change_rows(self, at: "Iteration") -> None:
+        if self.changes(at.iteration):
+            self._relocate(at.iteration)
+            self._grow(at.iteration)
+
+    def after_step(self, at: "Iteration") -> None:
+        """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
+        from scene.gaussians.morton import sort_rows
+        from splatting.features.mcmc_rules import add_noise
+
+        if self.changes(at.iteration):
+            sort_rows(self._gaussians)
+        factor = self._gaussians.enlargement**2  # as covariances have the square of the unit
+        rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise * factor
+        add_noise(self._gaussians, rate, seed=self._opt.seed, iteration=at.iteration)
+
+    def _relocate(self, iteration: int) -> None:
+        """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`count_limit`)."""
+        from scene.gaussians.adc import refuse_empty, remove_useless
+        from splatting.features.mcmc_rules import relocate
+
+        least = self._opt.mcmc_min_opacity
+        count = self._gaussians.gaussian_count
+        if 0 < (most := self._limit(iteration, count, 0)) < count:
+            remove_useless(self._gaussians, least, most)
+        dead = relocate(self._gaussians, least, seed=self._opt.seed, iteration=iteration)
+        empty = dead == self._gaussians.gaussian_count
+        refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
+
+    def _grow(self, iteration: int) -> None:
+        """Grow to `_grown`."""
+        from splatting.features.mcmc_rules import grow
+
+        count = self._gaussians.gaussian_count
+        new = self._grown(count, iteration) - count
+        if new > 0:
+            grow(self._gaussians, new, seed=self._opt.seed, iteration=iteration)
+
+    def _grown(self, count: int, iteration: int) -> int:
+        """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
+        growth = self._opt.mcmc_growth
+        most = self._limit(iteration, count, self.max_gaussians)
+        return min(max(int((1 + growth) * count), count + (growth > 0)), most)
+
+    def _limit(self, iteration: int, count: int, limit: int) -> int:
+        return self.schedule.count_limit(iteration, count, limit, self.max_gaussians)

@@ -1,0 +1,140 @@
+"""Poses that are trained with the Gaussians (--refine_poses): a small correction of each training camera's."""
+
+import copy
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from groundwork.files.json_files import MODEL_JSON, read_json, write_json
+from groundwork.finding import Finding, note
+from splatting.option import Option
+from splatting.part import Needs, Options, Part, Scored, fill
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from scene.cameras import Camera
+    from scene.readers.info import CameraInfo, SceneInfo
+    from scene.readers.tracks import Track
+    from scene.scene import Scene
+
+NAME = "poses.json"
+_WITHOUT = "write refine_poses=false into model.json to render from the dataset's poses"
+_REMEDY = f"save the model again, or {_WITHOUT}"
+
+
+class RefinePoses(Part):
+    """Gives the cameras their poses, which take steps on the host, and keeps them in poses.json."""
+
+    name = "refine_poses"
+    # fmt: off
+    options = Options(model=(
+        Option("refine_poses", False, origin="ours", stored=MODEL_JSON, topic="cameras",
+            help="correct the pose of each training camera together with the Gaussians, by at most 3 degrees; needs "
+                 "the tracks of a COLMAP scene"),
+    ))
+    # fmt: on
+    needs = Needs(files=True)
+    against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
+
+    @classmethod
+    def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
+        raise UserError(f"{given.start_checkpoint} was trained with --{cls.name}; give that option")
+
+    def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
+        self._elsewhere = bool(getattr(args, "other_scene", ""))
+        return info if fresh or self._elsewhere else with_poses(info, args.model_path)
+
+    def begin(self, run: Any, state: Any) -> None:
+        from splatting.features.refine_poses_steps import PoseRefinement
+
+        self.poses = PoseRefinement(run.scene, run.dataset.source_path, run.opt.iterations)
+        if run.start:
+            self.poses.restore(state)
+        fill(run, "camera_steps", self.poses, self)
+
+    def ready(self, run: Any) -> None:
+        """Only now cameras leave where they were when a new training began, as other parts have measured them."""
+        self.poses.place()
+
+    def records(self) -> dict[str, float]:
+        return self.poses.corrections()
+
+    def state(self) -> dict[str, Any]:
+        return self.poses.captured()
+
+    def scored(self, scene: "Scene", pipe: "argparse.Namespace", background: Any) -> dict[str, Scored]:
+        """Test views as the dataset has them."""
+        from splatting.records.renders import GIVEN_POSES
+
+        views = [] if self._elsewhere else [copy.copy(camera) for camera in scene.getTestCameras()]
+        for camera in views:
+            given = scene.given_test_views[camera.uid]
+            camera.place(given.R, given.T)
+        return {GIVEN_POSES: (None, views)} if views else {}
+
+    def save(self, scene: "Scene") -> None:
+        write_poses(scene.model_path, scene.getTrainCameras(), scene.getTestCameras())
+
+
+def write_poses(folder: str | os.PathLike, train: "Sequence[Camera]", test: "Sequence[Camera]") -> None:
+    """Write the poses of both lists of cameras, in the dataset's order: names, and R and T as `Camera` has them."""
+    import numpy as np
+
+    lists = {"train": train, "test": test}
+    table = {
+        name: [
+            {"img_name": camera.image_name, "R": np.asarray(camera.R).tolist(), "T": np.asarray(camera.T).tolist()}
+            for camera in sorted(cameras, key=lambda camera: camera.uid)
+        ]
+        for name, cameras in lists.items()
+    }
+    write_json(Path(folder) / NAME, table)
+
+
+def with_poses(info: "SceneInfo", folder: str | os.PathLike) -> "SceneInfo":
+    """A dataset with the poses of a model folder's poses.json. UserError for a file that does not fit the dataset."""
+    path = Path(folder) / NAME
+    try:
+        table = dict(read_json(path))
+    except OSError as error:
+        raise UserError(f"cannot read {path} ({error.strerror}); {_REMEDY}") from error
+    except (TypeError, ValueError, RecursionError) as error:
+        raise UserError(f"{path} is no table of poses; {_REMEDY}") from error
+    lists = {name: getattr(info, f"{name}_cameras") for name in ("train", "test")}
+    return info._replace(**{f"{name}_cameras": _placed(views, table.get(name), path) for name, views in lists.items()})
+
+
+def _placed(views: "Sequence[CameraInfo]", entries: Any, path: Path) -> "list[CameraInfo]":
+    import numpy as np
+
+    names = [view.image_name for view in views]
+    try:
+        if [entry["img_name"] for entry in entries] != names:
+            raise UserError(f"{path} is of other views than the scene's; {_REMEDY}")
+        poses = [(np.array(entry["R"], dtype=np.float64), np.array(entry["T"], np.float64)) for entry in entries]
+    except (TypeError, KeyError, ValueError) as error:
+        raise UserError(f"{path} has no list of poses; {_REMEDY}") from error
+    if any(R.shape != (3, 3) or T.shape != (3,) for R, T in poses):
+        raise UserError(f"{path} has a pose that is not R (3, 3) and T (3,); {_REMEDY}")
+    if any("lens" in entry for entry in entries):
+        raise UserError(f"{path} has refined lenses, which this version does not support; {_WITHOUT}")
+    return [view._replace(R=R, T=T) for view, (R, T) in zip(views, poses, strict=True)]
+
+
+def advise(scene: "Scene", tracks: "Sequence[Track | None]") -> Iterator[Finding]:
+    """Whether tracks ask for other poses."""
+    from scene.checks.fit import pose_errors, poses_differ
+
+    found = pose_errors(scene.info.train_cameras, tracks, scene.cameras_extent) if any(tracks) else None
+    if found is not None:
+        given, best = found
+        text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
+        yield note(text, "--refine_poses" if poses_differ(given, best) else "")
+
+
+def for_wrong_poses(best: bool) -> str:
+    """What to do where points are not where photos show them. best: other poses would fit far better."""
+    return "train with --refine_poses" if best else "--refine_poses corrects 3 degrees at most"

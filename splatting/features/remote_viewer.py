@@ -1,0 +1,131 @@
+"""The remote viewer of the reference (--ip, --port, --disable_viewer), by gaussian_renderer/network_gui.py."""
+
+import argparse
+from typing import TYPE_CHECKING, Any
+
+from splatting.option import Option
+from splatting.part import Error, Options, Part
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from gaussian_renderer.network_message import Request
+    from scene.gaussian_model import GaussianModel
+    from splatting.iteration import Iteration, Losses
+
+_TICK = 0.1  # seconds between looks whether a signal asks to stop
+_LAST = 1.0  # seconds that a finished training waits for one more request
+
+
+class RemoteViewer(Part):
+    """Listens for a viewer, and serves it. Where the caller of a training listens already, it serves that one's.
+
+    Training waits only while the viewer says so. Otherwise a request is answered when it is there, one an iteration.
+    The last iteration's are answered after everything is written, and keep_alive holds the process there.
+    """
+
+    name = "remote_viewer"
+    # fmt: off
+    options = Options(launch=(
+        Option("ip", "127.0.0.1", help="address to listen at for the remote viewer", topic="viewers"),
+        Option("port", 6009, help="port for the remote viewer, 0: any free one", topic="viewers"),
+        Option("disable_viewer", False, called=True, help="open no port for the remote viewer", topic="viewers"),
+    ))
+    # fmt: on
+    told_last = True
+    _asked = False
+
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        return True
+
+    def begin(self, run: Any, state: Any) -> None:
+        from gaussian_renderer import network_gui
+
+        # No process of several can draw a view by itself.
+        self.active = not run.group.several and not (run.launch.disable_viewer and network_gui.listener is None)
+
+    def opened(self, run: Any) -> None:
+        from gaussian_renderer import network_gui
+
+        self._run, self._gui = run, network_gui
+        if not run.launch.disable_viewer:
+            ip, port = self.options.launch[:2]
+            address = run.launch.ip, run.launch.port
+            run.resources.enter_context(self._gui.listening(*address, address != (ip.default, port.default)))
+
+    def due(self, at: "Iteration") -> bool:
+        if self._gui.conn is None:
+            self._gui.try_connect()
+        self._asked = self._gui.is_asked() and not at.last
+        return self._asked
+
+    def measured(self, at: "Iteration", losses: "Losses") -> None:
+        if self._asked:
+            with self._run.clock.paused("viewing"):
+                self._serve(last=False)
+
+    def ended(self, error: Error) -> None:
+        if error is None:
+            if self._gui.conn is None:
+                self._gui.try_connect()
+            if self._gui.holds(last=True):
+                print("The model is saved; this process runs until the viewer disconnects, or until Ctrl-C")
+            self._serve(last=True)
+        self._gui.disconnect()
+
+    def _serve(self, last: bool) -> None:
+        """Answer until the viewer lets training go on, leaves, or a signal asks to stop."""
+        while self._has_request(last) and self._answer():
+            if not self._gui.holds(last):
+                return
+
+    def _has_request(self, last: bool) -> bool:
+        """Whether a request is there, after waiting for it if the viewer wants that."""
+        while self._gui.holds(last) and not self._run.interrupt.requested:
+            if self._gui.is_asked(_TICK):
+                return True
+        return self._gui.is_asked(_LAST if last else 0.0) and not self._run.interrupt.requested
+
+    def _answer(self) -> bool:
+        """Answer one request; whether the viewer is still there."""
+        from gaussian_renderer.network_transfer import ViewerLost
+
+        try:
+            request = self._gui.receive_request()
+            frame = None if request is None else self._frame(request)
+            self._gui.send(frame, self._run.dataset.source_path)
+        except ViewerLost:
+            return False
+        return True
+
+    def _frame(self, request: "Request") -> memoryview:
+        from gaussian_renderer.network_transfer import ViewerLost
+        from utils.system_utils import first_line
+
+        run = self._run
+        try:
+            return frame_bytes(request, run.gaussians, run.pipe, run.background)
+        except Exception as error:  # such as a frame that memory does not suffice for: no reason to end a training
+            fault = f"its frame cannot be rendered ({first_line(error)})"
+            self._gui.disconnect(fault)
+            raise ViewerLost(fault) from error
+
+
+def frame_bytes(
+    request: "Request", gaussians: "GaussianModel", pipe: argparse.Namespace, background: "Tensor"
+) -> memoryview:
+    """RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
+
+    pipe: options of the training, which stay as they are; for the frame, the request's two switches count instead.
+    """
+    import torch
+
+    from gaussian_renderer import render
+
+    switches = {"convert_SHs_python": request.shs_python, "compute_cov3D_python": request.rot_scale_python}
+    camera, pipe = request.camera(background.device), argparse.Namespace(**vars(pipe) | switches)
+    options = {"want_depth": False, "want_visibility": False}
+    with torch.no_grad():
+        image = render(camera, gaussians, pipe, background, request.scaling_modifier, **options)["render"]
+    return memoryview((image * 255).byte().permute(1, 2, 0).contiguous().cpu().numpy())

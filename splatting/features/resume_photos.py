@@ -1,0 +1,107 @@
+"""Photos that a checkpoint has not trained on, by the cameras.json of its folder. They train more often at first."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from groundwork.files.json_files import read_json
+from groundwork.host.listing import some
+from scene.cameras import Camera, camera_to_JSON
+from scene.readers.holdout import EVERY
+from scene.readers.info import HOLD
+from splatting.folder import lies_in
+from splatting.iteration import ViewOrder
+from utils.system_utils import UserError
+
+_CLOSE = 1e-4  # of the extent, and of a rotation's entries: poses that were written and read again differ by less
+
+
+class NewFirst(ViewOrder):
+    """The order in which every second iteration after `since`, up to `until`, trains on a photo of `names`."""
+
+    def __init__(self, every: ViewOrder, since: int, until: int, names: list[str]) -> None:
+        super().__init__(every.cameras, every.seed)
+        new = {*names}
+        sides = [[view for view in every.cameras if (view.image_name in new) is side] for side in (True, False)]
+        self._turns = [ViewOrder(views, every.seed) for views in sides] if all(sides) else []
+        self._span = range(since + 1, until + 1)
+
+    def __getitem__(self, iteration: int) -> Camera:
+        if not self._turns or iteration not in self._span:
+            return super().__getitem__(iteration)
+        turn, old = divmod(iteration - self._span.start, 2)
+        return self._turns[old][turn + 1]
+
+
+def restored(every: ViewOrder, record: Any) -> ViewOrder:
+    """The order by the record of a checkpoint. UserError if it is broken."""
+    try:
+        return NewFirst(every, **record)
+    except TypeError as error:
+        raise UserError("the checkpoint's record of added photos is damaged; give another checkpoint") from error
+
+
+def new_photos(run: Any) -> dict[str, Any] | None:
+    """The record of photos that the folder of the checkpoint does not list; None if it lists all, or none of them.
+
+    UserError for others that have moved, for trained ones that would be held out now, and for the checkpoint's own
+    folder, which keeps which photos its checkpoints have seen.
+    """
+    if not run.start or not (before := _poses_in(Path(run.start).parent)):
+        return None
+    info, source = run.scene.info, run.dataset.source_path
+    now = {view.image_name: _pose(camera_to_JSON(0, view)) for view in (*info.test_cameras, *info.train_cameras)}
+    new, known = sorted(now.keys() - before.keys()), sorted(now.keys() & before.keys())
+    if not new or not known:
+        return None
+    close = _CLOSE * np.array([[run.scene.cameras_extent], [1], [1], [1]])
+    if moved := [name for name in known if (np.abs(now[name] - before[name]) > close).any()]:
+        raise UserError(
+            f"photos of {source} have other poses than when {run.start} was trained ({some(moved)}); register new "
+            "photos in its COLMAP model with all others fixed, or train from the start"
+        )
+    _refuse_held_out(run, [view.image_name for view in info.test_cameras], len(now), [*before])
+    if lies_in(run.start, run.dataset.model_path):
+        raise UserError(
+            f"{source} has photos that {run.start} was not trained on; give --start_checkpoint {run.start} and name "
+            "another folder by -m, as this one keeps the model without them"
+        )
+    return {"since": run.first_iteration, "until": _until(run, new), "names": new}
+
+
+def _poses_in(folder: Path) -> dict[str, np.ndarray]:
+    """Poses of cameras.json by name, in its order; none if there is no such file, or it is of another form."""
+    try:
+        return {view["img_name"]: _pose(view) for view in read_json(folder / "cameras.json")}
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}
+
+
+def _pose(record: dict[str, Any]) -> np.ndarray:
+    """Position and rotation (4, 3)."""
+    return np.array([record["position"], *record["rotation"]], float).reshape(4, 3)
+
+
+def _refuse_held_out(run: Any, tests: list[str], count: int, before: list[str]) -> None:
+    """UserError if test views were trained on. With every HOLD-th held out, new names move the count."""
+    if tests and run.options.holdout != EVERY:
+        raise UserError(
+            f"with more photos, --holdout {run.options.holdout} would hold out some that {run.start} was trained on; "
+            "start a new training"
+        )
+    trained = {*before[math.ceil(len(before) / HOLD) :]}.intersection(tests)  # cameras.json lists test views first
+    if trained and len(tests) == math.ceil(count / HOLD):  # else the scene says which views test
+        raise UserError(
+            f"--eval would hold out photos that {run.start} was trained on ({some(sorted(trained))}); leave --eval "
+            "out, or give the new photos names that come after the others"
+        )
+
+
+def _until(run: Any, names: list[str]) -> int:
+    """The iteration by which new photos have trained as often as the others, at most in the middle of what is left."""
+    since, last, views = run.first_iteration, run.schedule.ends, run.views.cameras
+    new = sum(view.image_name in names for view in views)
+    count = int(2 * new * (since / max(len(views) - new, 1)))
+    return since + (count if last is None else min(count, (last - since) // 2))  # None: a clock decides it

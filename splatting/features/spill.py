@@ -1,0 +1,131 @@
+"""The limit of what a training takes of a GPU (--gpu_memory): SH bands that do not fit lie in the host's memory.
+
+The limit must begin before the first rows exist, and the most rows of a checkpoint may not fit on the GPU at all. So
+the part gives the model its room in `check`, while the model is empty, not in `begin`.
+"""
+
+from typing import TYPE_CHECKING, Any
+
+from splatting.option import Option, within
+from splatting.part import Error, Options, Part, fill
+from utils.system_utils import UserError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from splatting.features.spill_memory import GpuMemory
+    from splatting.iteration import Iteration
+
+_BUS = 40e9  # bytes a second that kernels read or write in the host's memory
+_SLOW = 10.0  # milliseconds a step, from which on the bus is named
+
+
+class Spill(Part):
+    """Gives the model its room, says what of it lies on the host, and brings back what fits after a change.
+
+    It is in every training: without the option, a limit begins where a GPU is too small.
+    """
+
+    name = "spill"
+    # fmt: off
+    options = Options(optimisation=(
+        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
+            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
+                 "not fit are kept in the host's memory; slower, with the same result"),
+    ))
+    # fmt: on
+
+    @classmethod
+    def wanted(cls, given: "argparse.Namespace") -> bool:
+        return True
+
+    def check(self, run: Any, state: Any) -> None:
+        from splatting.features.spill_memory import GpuMemory, release_torch
+        from splatting.registry import part_class, strategies
+
+        if run.opt.gpu_memory:
+            refuse_without_gpu(run.device.type)
+        release_torch()  # from the limit of a training that was refused after this
+        self._model = run.gaussians
+        absolute = any(part_class(name).takes_absolute(run.opt) for name in strategies())
+        fill(self._model, "room", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
+
+    def ready(self, run: Any) -> None:
+        self._model.room.expect(-(-run.strategy.max_gaussians // run.group.size), run.scene)
+
+    def opened(self, run: Any) -> None:
+        announce(run, self._model.room)
+        self._model.room.settle(self._model)
+
+    def after_step(self, at: "Iteration") -> None:
+        if at.changes:
+            self._model.room.settle(self._model)
+
+    def ended(self, error: Error) -> None:
+        from splatting.features.spill_memory import release_torch
+
+        release_torch()
+
+
+def refuse_without_gpu(device: str) -> None:
+    """UserError where there is no memory to limit."""
+    if device != "cuda":
+        raise UserError("--gpu_memory limits the memory of a GPU, and there is none to use; leave it out")
+
+
+def announce(run: Any, memory: "GpuMemory") -> None:
+    """Say what lies in the host's memory, now or once there are as many Gaussians as there may be, and what it costs.
+
+    Warn if the host has too little for what is expected.
+    """
+    from scene import sleeping
+    from scene.gaussians.adam import GaussianAdam
+    from scene.in_view import share_of
+    from splatting.resources import expected_count
+
+    now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size
+    later = expected_count(most, now)
+    if far := memory.host_bytes(-(-later // size)):
+        _announce_host(run.scene.images, far, f"{later:,} Gaussians", size)
+    count = -(-max(now, most) // size)
+    if memory.host_bytes(count):
+        share = share_of(run.scene, run.device)
+        dense = run.sleeping is None and type(run.gaussians.optimizer) is GaussianAdam
+        same = run.sleeping is None or share < sleeping.MOST_SHARE  # blocks would sleep in any case
+        print("\n".join(sentences(memory, count, 1.0 if dense else share, same)))
+
+
+def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
+    """Print what the host has to hold, besides photos there; warn if it does not fit."""
+    import torch
+
+    from groundwork.host.memory import gib
+    from splatting.resources import REMEDY, announce_device, warn_of
+
+    host = torch.device("cpu")
+    pictures = images.planned_bytes if images.keep_on == host else 0
+    each = f" for each of {size} processes" if size > 1 else ""
+    room = announce_device(host, f"{gib(needed)} of {what}{each}", pictures, pictures + needed)
+    if room < needed:
+        warn_of(host, what, f"set a lower --max_num_splats, or {REMEDY}")
+
+
+def sentences(memory: "GpuMemory", count: int, seen: float, same: bool) -> list[str]:
+    """What to say before a training of so many Gaussians, of which some are spilled.
+
+    seen: the part of them that a step concerns. same: whether the files do not depend on that.
+    """
+    from groundwork.host.memory import gib
+
+    spilled = memory.host_bytes(count)
+    said = [
+        f"{gib(spilled)} of {count:,} Gaussians are kept in the host's memory, as all of them need more than "
+        f"{gib(memory.limit)} of the GPU's; the saved files are the same" + ("" if same else " up to rounding")
+    ]
+    milliseconds = 1e3 * 2 * spilled * seen / _BUS
+    if milliseconds > _SLOW:
+        said.append(
+            f"transfers from and to that memory limit the speed to about {milliseconds:.0f} ms a step, which updates "
+            f"{seen:.0%} of the Gaussians"
+        )
+    return said

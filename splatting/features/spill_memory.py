@@ -1,0 +1,146 @@
+"""How much of a GPU's memory a training takes, and which rows of the SH bands above 0 lie on the host to keep to it."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from groundwork.host.memory import free_memory
+from scene.gaussian_model import GaussianModel
+from scene.gaussians.spilled import Room, bytes_of, empty_rows, is_spilled
+from scene.scene import Scene
+from splatting.resources import PER_PIXEL, largest_view, photo_bytes, training_bytes
+
+_USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch cannot fill what it holds
+_PAGE = 2 << 20  # bytes; a spilled tensor has whole pages in each memory
+_SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
+_LEAST_SPARE = 1 << 27  # bytes, for the lists of the first step
+_WHOLE_STEP = 20  # bytes of a Gaussian besides the estimate, in steps for which all blocks wake
+
+
+def spillable_bytes(gaussians: GaussianModel, count: int) -> int:
+    """Bytes of what of `count` Gaussians may lie in the host's memory: SH bands above 0 and their two averages."""
+    return count * 4 * 3 * math.prod(gaussians._attributes["f_rest"].shape)
+
+
+def resident_rows(limit: float, count: int, others: float, spillable: float) -> int:
+    """How many rows of what may lie in the host's memory stay on a GPU, of which `limit` bytes may be taken.
+
+    others, spillable: bytes of all else, and of these rows.
+    """
+    return max(min(int(count * (limit - others) / spillable), count), 0) if spillable else count
+
+
+class GpuMemory(Room):
+    """Decides how many rows of f_rest and its averages stay on the GPU.
+
+    While rows change, new tensors find the GPU's memory taken by the old ones. What lacks room lies on the host until
+    `settle` brings it back. limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is
+    spilled. It spills nothing before `expect` knows the scene.
+    """
+
+    def __init__(self, limit: float, gaussians: GaussianModel, absolute: bool, device: torch.device) -> None:
+        """Take a limit in GiB, 0 for none. absolute: with absolute gradients."""
+        self.limit, self._device = int(limit * 2**30), device
+        self._each = training_bytes(gaussians, 1, 0, absolute) + _WHOLE_STEP
+        self._spillable = spillable_bytes(gaussians, 1)
+        self._fixed = 0
+        if self.limit and device.type == "cuda":  # other programs may have a part of what was given
+            there = torch.cuda.mem_get_info(device)[0] + torch.cuda.memory_reserved(device)
+            self.limit = min(self.limit, int(_USABLE * there))
+        self._limit_torch(0)
+
+    def expect(self, count: int, scene: Scene) -> None:
+        """Take note of a number of this process's Gaussians that will come: a limit begins where they do not fit."""
+        self._fixed = PER_PIXEL * largest_view(scene) + photo_bytes(scene.images, self._device)
+        if self.limit or self._device.type != "cuda" or not CAN_SPILL:
+            return
+        limit = int(_USABLE * (free_memory(self._device) + torch.cuda.memory_allocated(self._device)))
+        if self._needed(count, limit) > limit:
+            self.limit = limit
+            self._limit_torch(0)
+
+    def empty_rows(self, like: Tensor, rows: int) -> Tensor | None:
+        """An uninitialised tensor for so many rows of f_rest; None: all may stay on the GPU."""
+        if not self._spills(rows):
+            self._limit_torch(0)
+            return None
+        each = self._resident_bytes(like, rows)
+        size = max(min(each, 3 * each - bytes_of()[0]), 0) if is_spilled(like) else 0
+        self._limit_torch(max(3 * each, bytes_of()[0] + size))
+        return empty_rows(like, rows, size)
+
+    def settle(self, gaussians: GaussianModel) -> None:
+        """Bring rows to the GPU for which there is room, now that rows have changed."""
+        if not self.limit or not self._spills(len(gaussians)):
+            return
+        rest = gaussians.raw("f_rest")
+        state = gaussians.optimizer.state.get(rest, {})
+        rest.data = self._settled(rest.data)
+        for name in ("exp_avg", "exp_avg_sq"):
+            if name in state:
+                state[name] = self._settled(state[name])
+
+    def _settled(self, values: Tensor) -> Tensor:
+        wanted = self._resident_bytes(values, len(values))
+        if not is_spilled(values) or bytes_of(values)[0] > wanted - _PAGE:
+            return values
+        return empty_rows(values, len(values), wanted).copy_(values)
+
+    def _resident_bytes(self, like: Tensor, rows: int) -> int:
+        """Bytes of so many rows of one tensor that may stay on the GPU."""
+        return self.resident_rows(rows) * math.prod(like.shape[1:]) * like.element_size()
+
+    def _spills(self, count: int) -> bool:
+        """Whether so many rows do not fit with all that a change of them needs."""
+        return self.limit > 0 and self._needed(count, self.limit) > self.limit
+
+    def _needed(self, count: int, limit: int) -> int:
+        return self._fixed + max(int(_SPARE * limit), _LEAST_SPARE) + count * self._each
+
+    def resident_rows(self, count: int) -> int:
+        """How many of so many rows stay on the GPU."""
+        if not self._spills(count):
+            return count
+        # The estimate has room for the copy of one of three tensors while rows change, which here lies on the host.
+        others = self._needed(count, self.limit) - count * self._spillable * 4 / 3
+        return resident_rows(self.limit, count, others, count * self._spillable)
+
+    def host_bytes(self, count: int) -> int:
+        """Bytes of so many Gaussians in the host's memory."""
+        return self._spillable * (count - self.resident_rows(count)) if self._device.type == "cuda" else 0
+
+    def remedy(self, count: int, lacking: float) -> str:
+        """The option, where nobody has set it and what it lets spill of so many Gaussians is what is lacking."""
+        helps = self._device.type == "cuda" and not self.limit and lacking <= count * self._spillable
+        return "set --gpu_memory, or " if helps else ""
+
+    def _limit_torch(self, near: int) -> None:
+        """Leave torch the limit less so many bytes, or those that spilled tensors have now."""
+        if self.limit and self._device.type == "cuda":
+            limit_torch(self.limit - max(near, bytes_of()[0]), self._device)
+
+
+CAN_SPILL = tuple(map(int, torch.__version__.split(".")[:2])) >= (2, 11)  # csrc/torch/spilled.cpp
+_before: list[float] = []  # the share of the GPU that torch might take before it got a limit; empty without one
+
+
+def limit_torch(limit: float, device: torch.device) -> None:
+    """Leave torch so many bytes of the GPU; `free_memory` then counts no others.
+
+    Its segments then grow and shrink, as lists that change their size would leave holes of a fifth of the limit.
+    """
+    if not _before:
+        _before.append(torch.cuda.get_per_process_memory_fraction())
+    if CAN_SPILL:
+        torch._C._accelerator_setAllocatorSettings("expandable_segments:True")
+    if torch.cuda.memory_reserved(device) > limit:
+        torch.cuda.empty_cache()
+    total = torch.cuda.get_device_properties(device).total_memory
+    torch.cuda.set_per_process_memory_fraction(min(max(limit / total, 0.0), 1.0))
+
+
+def release_torch() -> None:
+    """Let torch take what it might before."""
+    while _before:
+        torch.cuda.set_per_process_memory_fraction(_before.pop())

@@ -1,5 +1,0 @@
-"""`start.begin_cuda()` on import. A command that computes on a GPU imports this, and only where it is the program."""
-
-from splatting.host.start import begin_cuda
-
-begin_cuda()

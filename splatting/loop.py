@@ -1,0 +1,206 @@
+"""The training loop: an iteration from top to bottom, and what happens beside it."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from types import TracebackType
+
+import torch
+from torch import Tensor
+
+from gaussian_renderer import draw, exposed, in_world_units, render, wake
+from gaussian_renderer.memory_errors import memory_errors_explained
+from splatting.agreement import StepAgreement
+from splatting.faster import FasterSteps, faster_steps
+from splatting.iteration import Iteration, Losses
+from splatting.log import ProgressBar, Records, Summary
+from splatting.part import Error, Part, overrides
+from splatting.run import Run
+from splatting.save import Saves
+from splatting.scores import Scores, training_report
+from splatting.watch import MaskWatch
+
+_REMEDY = "lower --resolution (-r), --max_num_splats or --images_to_load, and resume from the last checkpoint"
+
+
+def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
+    """The step of an iteration as the paper has it (Kerbl et al. 2023, Sections 4 to 6), by autograd.
+
+    Every gradient of every parameter is there for whoever wants it: objectives, strategies and hooks of others.
+    """
+    gaussians, strategy, options = run.gaussians, run.strategy, run.render_options(at)
+    _prepare_rows(run, at)  # all of them, unless blocks of rows sleep (scene/sleeping.py)
+    package = render(at.camera, gaussians, run.pipe, at.background, **options)
+    planes = _planes(package, run)
+    if gaussians.exposures.applied:
+        package["render"] = exposed(package["render"], at.camera, gaussians)
+    losses = run.objective(package, at)  # (1 - lambda) L1 + lambda (1 - SSIM), and terms of parts
+    losses.total.backward()
+    if _is_for_sleepers(run):
+        _stop_skipping(run)
+        return plain_step(run, at, tell)
+    if planes and at.steps:
+        _step_camera(run, at, planes)  # a view's pose and lens, where they are trained
+    if any(strategy.penalty):
+        gaussians.penalise(strategy.penalty)  # a part of the loss that no render shows
+    tell.measured(at, losses)  # progress, scores and saves of the model as it was rendered
+    strategy.after_backward(at, package)  # statistics; clone, split, prune, reset opacities
+    if at.steps:  # as in the reference, the last iteration takes no step
+        gaussians.step(package["radii"])  # Adam
+        run.after_step(at)
+
+
+def run_training(run: Run, observers: Sequence[Part]) -> None:
+    """Take the iterations of a run.
+
+    Whatever else happens in them is an observer's business, in the order of the list (`standard_observers`).
+    Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
+    """
+    for _ in training_steps(run, observers):
+        pass
+
+
+def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iteration, FasterSteps]]:
+    """`run_training` by iterations. Yields each, and what takes steps faster than `plain_step`, to the same bytes.
+
+    Once that is drained, and within `run.flushed_view()`, others may read the model.
+    """
+    faster = faster_steps(run)
+    barrier = StepAgreement(run.group, run.interrupt, getattr(run.gaussians.optimizer, "guard", None))
+    tell = Announcer([barrier, *observers], run.flushed_view)
+    at = None
+    try:
+        # Backward runs on this thread: waking autograd's worker costs time in every iteration.
+        explained = memory_errors_explained(run.gaussians, run.views.cameras, _REMEDY, "training")
+        with explained, run.interrupt, tell, torch.autograd.set_multithreading_enabled(False):
+            try:
+                for at in run.iterations():  # a view in the order of the seed, its background, terms of the loss
+                    tell.begins(at)  # who reads or writes the model in it?
+                    faster.throttle(at)  # before the learning rates are set, which a replayed step changes
+                    run.prepare(at)  # learning rates, SH degree, photos of the next views
+                    if not faster.take(at, tell):
+                        plain_step(run, at, tell)
+                    at.stopping = barrier.stopping  # read once: a signal may come at any moment
+                    if at.stopping:
+                        faster.drain()
+                    if at.rests:
+                        run.gaussians.drop_gradients()  # the earlier run, which ended here, left none to the next one
+                    tell.stepped(at)  # checkpoints, viewers
+                    if at.stopping:
+                        raise at.stopping
+                    yield at, faster
+            except BaseException:
+                faster.abort()
+                raise
+    except KeyboardInterrupt:
+        if at is not None and at.stopping:
+            barrier.wait()
+        raise
+    tell.ended()  # out here a signal stops at once what is only drawn and printed
+
+
+def standard_observers(run: Run) -> list[Part]:
+    """What happens beside the iterations of every training, and the run's parts in their places among it."""
+    if run.report is not training_report:
+        run.stop_skipping()  # it may read or change the model in every iteration
+    return [
+        run.watch,  # first: observers that write rely on all losses so far being finite
+        *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
+        MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
+        *(part for part in run.parts if not part.told_last),
+        Scores(run),
+        Saves(run),  # before the model changes
+        Records(run),  # after all that add to the iteration's record
+        Summary(run),  # after all that say something at the end
+        run.checkpoints,  # writes the whole state after the step
+        *(part for part in run.parts if part.told_last),
+    ]
+
+
+class Announcer:
+    """Calls the hooks of parts, in the order of the list. Inside `with`, an error is told to `ended`."""
+
+    def __init__(self, parts: Sequence[Part], flushed: Callable[[], AbstractContextManager] = nullcontext) -> None:
+        """flushed: within it, parts are told of an iteration in which they read the model."""
+        self._flushed = flushed
+        self._begins, self._measured, self._stepped, self._ended = (
+            overrides(parts, hook) for hook in ("begins", "measured", "stepped", "ended")
+        )
+        self._due = [(due, due.__self__.reads_model) for due in overrides(parts, "due")]
+
+    def begins(self, at: Iteration) -> None:
+        # A list, so that each part is asked in every iteration, whatever the others answer.
+        due = [(due(at), reads) for due, reads in self._due]
+        at.due = at.changes or any(is_due for is_due, _ in due)
+        at.read = any(is_due and reads for is_due, reads in due)
+        for notify in self._begins:
+            notify(at)
+
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        with self._flushed() if at.read else nullcontext():
+            for notify in self._measured:
+                notify(at, losses)
+
+    def stepped(self, at: Iteration) -> None:
+        with self._flushed() if at.read or at.stopping else nullcontext():
+            for notify in self._stepped:
+                notify(at)
+
+    def ended(self, error: Error = None) -> None:
+        for notify in self._ended:
+            notify(error)
+
+    def __enter__(self) -> "Announcer":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: Error, trace: TracebackType | None) -> None:
+        if error is not None:
+            self.ended(error)
+
+
+# What a plain step does besides, where poses are trained or rows sleep
+
+
+def _planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
+    """Image and depth before exposures, which keep their gradients for the step of a camera; empty without one."""
+    if not run.camera_steps:
+        return []
+    planes = [package["render"], package["depth"]]
+    for plane in planes:
+        if plane is not None:
+            plane.retain_grad()
+    return planes
+
+
+def _step_camera(run: Run, at: Iteration, planes: list[Tensor | None]) -> None:
+    color, depth = (None if plane is None else plane.grad for plane in planes)
+    drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
+    run.step_camera(at, drawn.camera_gradient(color, in_world_units(depth, run.gaussians)))
+
+
+def _prepare_rows(run: Run, at: Iteration) -> None:
+    """Place a trained camera, and wake the blocks that the step concerns: all, where rows change or nothing follows."""
+    if run.camera_steps:
+        run.camera_steps.place(at.camera)
+    if not run.sleeping:
+        return
+    if at.changes or not at.steps:
+        run.sleeping.flush()
+    else:
+        wake(run.sleeping, at.camera, run.gaussians, run.pipe, at.background)
+        run.gaussians.optimizer.rows = run.sleeping.rows()
+
+
+def _is_for_sleepers(run: Run) -> bool:
+    """Whether the loss depends on a row that sleeps: somebody has added a term to it."""
+    rows = run.sleeping and run.gaussians.optimizer.rows
+    if rows is None:
+        return False
+    gradients = [run.gaussians.raw(name).grad for name in run.gaussians._attributes]
+    return any(bool(gradient[~rows].any()) for gradient in gradients if gradient is not None)
+
+
+def _stop_skipping(run: Run) -> None:
+    """Let all blocks wake for good, and drop the gradients of a step that will be taken again."""
+    run.gaussians.drop_gradients()
+    run.gaussians.optimizer.rows = None
+    run.stop_skipping()

@@ -1,0 +1,147 @@
+"""Scores in testing iterations: the reference's training report, and the observer that calls it."""
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from gaussian_renderer import render
+from gaussian_renderer.scored_views import ScoredViews, beside_test, shown_as_trained
+from scene import Scene
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from splatting.events import Events
+from splatting.iteration import Iteration, Losses
+from splatting.part import Part
+from utils.image_utils import as_float, mean_psnr, mse, pixels_that_count, psnr
+from utils.loss_utils import l1_loss
+
+if TYPE_CHECKING:
+    from splatting.run import Run
+
+SHOWN = 5  # views of a set whose images a writer gets
+
+
+class Scores(Part):
+    """Calls the run's report: `training_report` in testing iterations, what replaces it in all of them."""
+
+    def __init__(self, run: "Run") -> None:
+        self._run = run
+        self._planned = run.launch.test_iterations
+
+    def due(self, at: Iteration) -> bool:
+        return self._run.report is not training_report or at.takes(self._planned)
+
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        if not self.due(at):
+            return
+        run, seconds = self._run, self._run.clock.seconds - at.started
+        with run.clock.paused("scoring"):
+            if at.takes(self._planned):
+                run.scene.prefetch(run.scene.getTestCameras())
+            l1, total = torch.stack((losses.l1, losses.total)).detach().cpu()
+            tested = [at.iteration if t in at.span else -1 for t in self._planned]
+            scores = run.report(
+                run.writer, at.iteration, l1, total, l1_loss, seconds, tested,
+                run.scene, render, (run.pipe, run.background), run.scene.halves,
+            )  # fmt: skip
+        if scores:
+            at.record = (at.record or {}) | scores
+
+
+def training_report(
+    tb_writer: Any | None,
+    iteration: int,
+    l1: Tensor,
+    loss: Tensor,
+    l1_loss: Callable[[Tensor, Tensor], Tensor],
+    elapsed: float,
+    testing_iterations: Sequence[int],
+    scene: Scene,
+    renderFunc: Callable[..., dict[str, Tensor]],
+    renderArgs: tuple,
+    train_test_exp: bool = False,
+) -> dict[str, float]:
+    """In testing iterations, score and print test and five training views.
+
+    tb_writer: a SummaryWriter of TensorBoard, which gets scores, images and every tenth iteration's losses, or None.
+    elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
+    more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
+    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, `beside_test` included.
+    """
+    told = [Events(tb_writer, iteration)] if tb_writer else []
+    for events in told:
+        events.losses(l1, loss, elapsed)
+    if iteration not in testing_iterations:
+        return {}
+    options = {"use_trained_exp": True} if train_test_exp and len(renderArgs) < 6 else {}
+    if renderFunc is render:
+        options["want_depth"] = False  # our own addition: only images are scored
+
+    def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
+        exposed = {"use_trained_exp": True} if shown_as_trained(camera, gaussians) else {}
+        return renderFunc(camera, gaussians, *renderArgs, **options | exposed)["render"]
+
+    views = ScoredViews(*renderArgs[:2], train_test_exp, draw)
+    train, test = scene.getTrainCameras(), scene.getTestCameras()
+    sets = {"test": (views, test)}
+    for name, (how, cameras) in beside_test(scene, *renderArgs[:2]).items():
+        if how and how.halves:  # what they compare with
+            sets["test_right_halves"] = ScoredViews(*renderArgs[:2], True, draw), cameras
+        sets[f"test_{name}"] = how or views, cameras
+    sets |= {"train": (views, [train[i % len(train)] for i in range(5, 30, 5)])}
+    scores = {}
+    for name, (scored, cameras) in sets.items():
+
+        def show(camera: Camera, what: str, image: Tensor, name: str = name) -> None:
+            for events in told:
+                events.image(name, camera, what, image)
+
+        if means := _means(scored, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
+            line = f"[ITER {iteration}] Evaluating {name}: L1 {means['l1']:.5f}"
+            if "psnr" in means:
+                line += f" PSNR {means['psnr']:.3f} (mean of the channels'; {means.pop('whole'):.3f} as metrics.py)"
+            tqdm.write(line, file=sys.stdout)
+            for events in told:
+                events.scores(name, means)
+            scores |= {f"{name}_{kind}": value for kind, value in means.items()}
+    for events in told:
+        events.model(scene.gaussians)
+    return scores
+
+
+@torch.no_grad()
+def _means(
+    views: ScoredViews,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    l1_loss: Callable[[Tensor, Tensor], Tensor],
+    show: Callable[[Camera, str, Tensor], None],
+    photos: bool,
+) -> dict[str, float]:
+    """`l1`, `psnr` by channels and `whole`, by one error over them, the means over the views with a pixel that counts.
+
+    PSNRs of equal images or channels are left out, and so is what no view has. show: gets the renders of the first
+    views, and with `photos` their photos.
+    """
+    scores = []
+    for index, camera in enumerate(cameras):
+        image, target, mask = views.compared(camera, scene.gaussians)
+        if mask is not None and not mask.any():
+            continue
+        target = as_float(target)
+        counted = [pixels_that_count(x, mask) for x in (image, target)]
+        of_channels = psnr(*counted).flatten()
+        own = of_channels[~of_channels.isinf()]
+        whole = -10.0 * mse(*counted).mean().log10()
+        scores.append((l1_loss(*counted).item(), own.mean().item() if len(own) else None, whole.item()))
+        if index < SHOWN:
+            show(camera, "render", image)
+            if photos:
+                show(camera, "ground_truth", target)
+    columns = dict(zip(("l1", "psnr", "whole"), zip(*scores, strict=True), strict=False))
+    means = {name: mean_psnr(values) for name, values in columns.items()}
+    return {name: value for name, value in means.items() if value is not None}
