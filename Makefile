@@ -1,6 +1,8 @@
 # make demo   a scene made, trained, rendered and scored
 # make test   lint, format check, C++ tests of the CPU, pytest but for slow tests: three to five minutes
 # make check  make test, CUDA kernels emulated, and slow tests; what CI runs
+# make check-core, check-applications   the Python tests of make check in two halves: those of the core, in a copy of the
+#             repository without applications and benchmarks; and those that need these. What CI runs in place of make check
 # make test-aarch64, test-windows, test-macos   the C++ tests, built for another platform and run under an emulator
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used;
 #             without npm, those of other people's viewers skip
@@ -33,7 +35,7 @@ CXX_SOURCES := $(shell find submodules -name build -prune -o \( -name '*.cpp' -o
 sources = $(shell find submodules/common submodules/$(1) \( -name build -o -name tests -o -name emulation \) -prune -o \
             \( -name '*.cpp' -o -name '*.cu*' -o -name '*.h' -o -name '*.py' -o -name '*.toml' \) -print)
 
-.PHONY: install demo test check test-aarch64 test-windows test-macos test-browser test-foreign lint format docs wheels gate
+.PHONY: install demo test check check-core check-applications test-aarch64 test-windows test-macos test-browser test-foreign lint format docs wheels gate
 .PHONY: clean cpp-test cpp-test-cpu demo-plan
 unexport PYTHONDONTWRITEBYTECODE  # else each of hundreds of processes compiles the same modules
 ifndef PARALLEL  # which C++ tests set
@@ -68,13 +70,22 @@ output/demo_scene: | install
 	$(BIN)/python -m applications.demo.make_scene $@
 
 # More processes than cores, as some wait. test-foreign has the tests that are ignored. What takes long is named.
-PYTEST := $(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal \
-          --durations 25 --durations-min 5 --ignore tests/test_exports_foreign.py
+PYTEST := $(CURDIR)/$(BIN)/python -m pytest --numprocesses $(shell expr $(CORES) + 1) --maxprocesses 5 --dist worksteal \
+          --durations 25 --durations-min 5 --ignore applications/export/tests/test_exports_foreign.py
 test: install lint cpp-test-cpu
 	$(PYTEST) -m 'not browser and not slow'
 
 check: install lint cpp-test
 	$(PYTEST) -m 'not browser'
+
+check-core: install
+	rm -rf build/core && mkdir -p build/core
+	tar -c --exclude ./applications --exclude ./benchmarks --exclude ./build --exclude ./.git --exclude './.venv*' \
+	    --exclude node_modules --exclude ./output --exclude ./eval . | tar -x -C build/core
+	cd build/core && GS_SHARED="$${GS_SHARED:-$(CURDIR)/../shared}" $(PYTEST) -m 'not browser'
+
+check-applications: install
+	GS_TESTS=applications $(PYTEST) -m 'not browser'
 
 test-aarch64 test-windows test-macos:
 	$(PYTHON) .ci/cross.py $(@:test-%=%)
@@ -86,8 +97,8 @@ test-browser: install
 
 test-foreign: install
 	@if command -v npm > /dev/null; then cd tests/foreign && npm ci --ignore-scripts --no-audit --no-fund --silent; fi
-	PATH="$(CURDIR)/tests/foreign/node_modules/.bin:$$PATH" $(BIN)/python -m pytest tests/test_exports_foreign.py \
-	    tests/test_tileset.py tests/browser/test_streamed.py
+	PATH="$(CURDIR)/tests/foreign/node_modules/.bin:$$PATH" $(BIN)/python -m pytest applications/export/tests/test_exports_foreign.py \
+	    applications/export/tests/test_tileset.py tests/browser/test_streamed.py
 
 lint: $(VENV)/.requirements
 	$(BIN)/ruff check .

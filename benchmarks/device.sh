@@ -114,7 +114,7 @@ PYTHON
 
 test_all() {
   local gpu status=0
-  gpu=$(grep -lE 'mark\.gpu|GPU_MARKS|_AND_GPU' tests/test_*.py)
+  gpu=$(grep -rlE --include='test_*.py' 'mark\.gpu|GPU_MARKS|_AND_GPU' tests applications/*/tests benchmarks/tests)
   say "tests on the GPU"
   python3 -m pytest -q -p no:cacheprovider -m gpu $gpu || status=1
   say "tests of the rasterizer on the CPU"
@@ -125,7 +125,7 @@ test_all() {
 # Switch torch's memory pool off, or an access beyond an allocation would hit a neighbour and go unnoticed.
 sanitize() {
   local tool gpu status=0
-  gpu=$(grep -lE 'mark\.gpu|GPU_MARKS|_AND_GPU' tests/test_*.py)
+  gpu=$(grep -rlE --include='test_*.py' 'mark\.gpu|GPU_MARKS|_AND_GPU' tests applications/*/tests benchmarks/tests)
   for tool in memcheck racecheck; do
     say "$tool"
     PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 270 compute-sanitizer --tool "$tool" --error-exitcode 9 \

@@ -10,7 +10,7 @@ from lenses import make_lens
 from rasterizer_tools import rigid
 from torch import Tensor
 
-from benchmarks.workloads import splat_scenes
+from tests.workloads import splat_scenes
 
 WIDTH, HEIGHT = 96, 64
 PANORAMA = Lens("equirectangular", (WIDTH / (2 * math.pi), HEIGHT / math.pi), (WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5))

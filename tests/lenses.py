@@ -1,11 +1,8 @@
-"""One realistically distorted lens of every camera model of pycolmap, and views through these lenses."""
-
-from dataclasses import dataclass
+"""One realistically distorted lens of every camera model of pycolmap."""
 
 import numpy as np
 from diff_gaussian_rasterization.lens import Lens as NativeLens
 
-from applications.demo.tracer import View, normalize
 from scene.images.lens import Lens, import_pycolmap
 
 # Extra parameters in COLMAP's order. At a focal length of 0.75 widths they move the corners by a twentieth or more.
@@ -44,29 +41,6 @@ def colmap_camera(lens: Lens):
     return import_pycolmap().Camera(
         model=lens.model, width=lens.width, height=lens.height, params=list(lens.params), camera_id=1
     )
-
-
-@dataclass(frozen=True)
-class LensView(View):
-    """A view through a lens, which also sets the principal point: unlike in `View` it need not be the centre."""
-
-    lens: Lens
-
-    @property
-    def params(self) -> list[float]:
-        """COLMAP's parameters."""
-        return list(self.lens.params)
-
-    def rays(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return unit ray directions, as View.rays does."""
-        local = colmap_camera(self.lens).cam_ray_from_img(np.column_stack([x, y]).astype(np.float64))
-        return normalize((self.rotation.T @ local.T).astype(np.float32))
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points, as View.project does."""
-        local = self.rotation @ (points - self.center.reshape(3, 1))
-        x, y = colmap_camera(self.lens).img_from_cam(np.ascontiguousarray(local.T)).T
-        return x, y, local[2]
 
 
 def opencv_pixels(lens: NativeLens, points: np.ndarray) -> np.ndarray:

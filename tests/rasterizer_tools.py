@@ -18,7 +18,7 @@ from diff_gaussian_rasterization import ops as functions
 from diff_gaussian_rasterization.backend import OPERATORS as ops
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import on_device, settings
+from tests.workloads.splat_scenes import on_device, settings
 
 GPU_MARKS = (
     pytest.mark.gpu,

@@ -9,8 +9,8 @@ from diff_gaussian_rasterization.lens import Lens
 from rasterizer_tools import BOTH_AND_GPU, gradients, leaves, loss_of, render
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import KINDS, settings
 from scene.gaussians.statistics import Statistics
+from tests.workloads.splat_scenes import KINDS, settings
 
 SIZE = (21, 18)  # two tiles by two, cut off
 # Of the largest length; a few times the largest error measured, which is rounding of the sum over pixels.

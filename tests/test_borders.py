@@ -13,7 +13,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, reference
 from rasterizer_tools import BOTH_AND_GPU, Evaluated, errors_above, evaluate, on_device, ops, scene_arguments
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 FOCAL = 32.0
 SIZES = {"whole tiles": (64, 32), "cut tiles": (50, 21)}

@@ -13,10 +13,10 @@ from gaussians import model, pipeline
 from rasterizer_tools import BOTH_AND_GPU, error, few, loss_of, on_device, render, rigid
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer import render as render_model
 from scene.cameras import MiniCam
 from scene.poses import motion, moved
+from tests.workloads.splat_scenes import settings
 
 VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))
 SHEARED = VIEW.clone()

@@ -9,7 +9,7 @@ from diff_gaussian_rasterization.channels import rasterize_channels
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, activated, error, leaves
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import SplatScene, needles, on_device, ordinary
+from tests.workloads.splat_scenes import SplatScene, needles, on_device, ordinary
 
 COUNTS = (1, 2, 3, 4, 5, 8, 11, 32)
 

@@ -7,10 +7,10 @@ from gaussians import options, pipeline
 from rasterizer_tools import CPU_AND_GPU, ops
 from torch.profiler import ProfilerActivity, profile
 
-from benchmarks.workloads.splat_scenes import frustum, model_rows
 from gaussian_renderer import render
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
+from tests.workloads.splat_scenes import frustum, model_rows
 
 SPLATS, WIDTH, HEIGHT = 500, 70, 50
 

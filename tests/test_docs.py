@@ -15,6 +15,9 @@ from pathlib import Path
 
 import pytest
 
+import applications.demo  # noqa: F401  (pages are about the whole repository)
+import benchmarks  # noqa: F401
+
 ROOT = Path(__file__).resolve().parents[1]
 NAMES = ("README", "CONTRIBUTING", "CHANGELOG", "SECURITY", "paper", "benchmarks/README")
 PAGES = [

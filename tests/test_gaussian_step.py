@@ -15,7 +15,7 @@ from diff_gaussian_rasterization.scene import GRADIENTS, draw
 from rasterizer_tools import BOTH_AND_GPU, activated, ops, scene_arguments
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import PARAMETERS, frustum
+from tests.workloads.splat_scenes import PARAMETERS, frustum
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 FISHEYE = Lens("equidistant", (40.0, 40.0), (38.0, 25.0))

@@ -10,7 +10,7 @@ from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, Scene, draw
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops, scene_arguments
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
+from tests.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
 
 WIDTH, HEIGHT = 45, 70  # 3 x 5 tiles, some cut off
 ACROSS, DOWN = 3, 5

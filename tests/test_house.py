@@ -24,7 +24,6 @@ LONGEST = 60  # lines of a function
 # it. A room is all modules whose longest prefix it is.
 FLOORS = (
     *(("benchmarks.gate",), tuple(f"benchmarks.{name}" for name in BENCHMARKS), ("benchmarks.harness",)),
-    ("benchmarks.workloads",),
     ("benchmarks",),
     COMMANDS,
     ("applications.evaluation", "applications.nerfbaselines", "applications.viewer"),
@@ -69,7 +68,7 @@ def _tree(path: Path) -> ast.Module:
 
 def _python() -> list[Path]:
     """All Python files but tests, as a clone has them."""
-    files = [path for room in ROOMS for path in (ROOT / room).rglob("*.py")]
+    files = [path for room in ROOMS for path in (ROOT / room).rglob("*.py") if "tests" not in path.parts]
     files += [ROOT / f"{name}.py" for name in COMMANDS]
     files += [path for path in CSRC.rglob("*.py") if "build" not in path.relative_to(CSRC).parts]
     return sorted(files)

@@ -11,7 +11,7 @@ from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, draw
 from rasterizer_tools import GPU_MARKS, error, scene_arguments
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import FOV, PARAMETERS, SplatScene, on_device, settings
+from tests.workloads.splat_scenes import FOV, PARAMETERS, SplatScene, on_device, settings
 
 pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization

@@ -14,10 +14,10 @@ from processes import in_ranks
 from rasterizer_tools import leaves, ops, scene_arguments
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer.over_ranks.band import decisive_in, draw_view
 from gaussian_renderer.over_ranks.rasterize import rasterize_over
 from groundwork.ranks.ranks import ranks
+from tests.workloads.splat_scenes import settings
 
 SIZES = [2, 3]
 CAMERA = "viewmatrix", "campos"

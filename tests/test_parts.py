@@ -64,7 +64,8 @@ def _heirs(name: str) -> list[str]:
 
 def _files(name: str) -> Iterator[Path]:
     """All Python files of the project that may not know a part: all but its own, its heirs' and the registry."""
-    found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
+    found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py") if "tests" not in path.parts)]
+    found += [ROOT / f"{c}.py" for c in COMMANDS]
     registry = ROOT / "splatting" / "registry.py"
     may = [registry, *(path for one in (name, *_heirs(name)) for path in _own(one))]
     yield from (path for path in found if path not in may)
@@ -130,7 +131,7 @@ IMPORTED = """
 from importlib import import_module
 left_out = "applications.nerfbaselines", *(f"splatting.features.{name}" for name in hidden)
 for room in words:
-    paths = Path(room).rglob("*.py") if Path(room).is_dir() else [Path(room)]
+    paths = [p for p in Path(room).rglob("*.py") if "tests" not in p.parts] if Path(room).is_dir() else [Path(room)]
     for path in sorted(paths):
         module = ".".join(path.with_suffix("").parts).removesuffix(".__init__")
         if not module.endswith("__main__") and not module.startswith(left_out):

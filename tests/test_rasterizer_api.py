@@ -12,7 +12,7 @@ from diff_gaussian_rasterization import (
 from diff_gaussian_rasterization.scene import draw
 from rasterizer_tools import activated, few, keywords, leaves, render, scene_arguments
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 COVARIANCE = torch.eye(3)[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].repeat(3, 1)  # of three spheres
 

@@ -5,7 +5,7 @@ import torch
 from diff_gaussian_rasterization.optim import adam_, observe_, sparse_adam_
 from rasterizer_tools import GPU_MARKS, gradients, scene_arguments
 
-from benchmarks.workloads.splat_scenes import SplatScene, frustum
+from tests.workloads.splat_scenes import SplatScene, frustum
 
 pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization

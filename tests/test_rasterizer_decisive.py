@@ -8,7 +8,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive
 from rasterizer_tools import BOTH_AND_GPU, leaves, one_splat, pick, render, together
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import SplatScene, frustum, on_device, settings
+from tests.workloads.splat_scenes import SplatScene, frustum, on_device, settings
 
 SIZE = (75, 53)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, pick, render, rigid, scene_arguments
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 from utils.sh_utils import RGB2SH
 
 # With steps of 1e-6, truncation and rounding leave errors of some 1e-9; a wrong term is far above 1e-6.

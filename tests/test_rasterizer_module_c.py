@@ -8,7 +8,7 @@ from diff_gaussian_rasterization import _C, GaussianRasterizer, optim
 from rasterizer_tools import CPU_AND_GPU, activated, few, leaves
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import on_device, settings
+from tests.workloads.splat_scenes import on_device, settings
 
 EMPTY = torch.Tensor([])
 

@@ -7,8 +7,8 @@ from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.scene import draw
 from rasterizer_tools import few, ops, render, scene_arguments
 
-from benchmarks.workloads.splat_scenes import settings
 from groundwork.ranks.rows import BLOCK
+from tests.workloads.splat_scenes import settings
 
 
 def test_the_fake_kernels_have_the_sizes_of_the_real_ones():

@@ -19,7 +19,7 @@ from lens_scenes import HEIGHT, PANORAMA, WIDTH, everywhere, lens, view_through
 from rasterizer_tools import BOTH_AND_GPU, Evaluated, activated, error, errors_above, evaluate, on_device, render, rigid
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import KINDS, settings
+from tests.workloads.splat_scenes import KINDS, settings
 
 SIZE = (45, 35)  # no multiple of the tile
 VIEW = rigid((0.9, 0.3, -0.4, 0.2), (0.7, -0.4, 1.1))

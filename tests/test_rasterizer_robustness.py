@@ -12,7 +12,7 @@ from diff_gaussian_rasterization.lens import Lens
 from rasterizer_tools import CPU_AND_GPU, PLANES, activated, gradients, leaves, pick, render
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import KINDS, on_device, ordinary, settings
+from tests.workloads.splat_scenes import KINDS, on_device, ordinary, settings
 
 N, VICTIM, SIZE = 40, 17, (75, 53)
 NOT_FINITE = [math.nan, math.inf, -math.inf]

@@ -7,7 +7,7 @@ import torch
 from diff_gaussian_rasterization.ops import mark_visible
 from rasterizer_tools import DTYPES_AND_GPU, one_splat, render, together
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 MIDDLE = (..., 8, 8)  # of 17 x 17: the optical axis goes exactly through this pixel's centre

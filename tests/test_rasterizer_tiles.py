@@ -6,8 +6,8 @@ import pytest
 import torch
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, assert_culling_is_exact, borderline_splats, ops, scene_arguments
 
-from benchmarks.workloads.splat_scenes import KINDS, settings
 from groundwork.host.machine import instruction_set
+from tests.workloads.splat_scenes import KINDS, settings
 
 SIZE = (75, 53)
 

@@ -13,7 +13,7 @@ from rasterizer_tools import render
 from scipy.optimize import minimize_scalar
 from scipy.stats import multivariate_normal
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 WIDTH, HEIGHT = 48, 32
 FISHEYE = Lens("equidistant", (14.0, 14.0), (23.0, 15.0), radial=(0.05, -0.01, 0.0, 0.0))

@@ -17,8 +17,8 @@ from rasterizer_tools import few, leaves, render
 import export
 import render as command
 import train
-from benchmarks.workloads.splat_scenes import settings
 from gaussian_renderer import rasterizer_settings
+from tests.workloads.splat_scenes import settings
 
 SMALL = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
 

@@ -11,7 +11,7 @@ from rasterizer_tools import few, render
 from simple_knn._C import distCUDA2
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 IMAGE, PICTURE = torch.zeros(3, 20, 20), torch.zeros(4, 2, 2, dtype=torch.uint8)
 LENS = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))

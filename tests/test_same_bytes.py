@@ -26,8 +26,8 @@ from test_simple_knn import cloud
 from test_split_positions import _parents as some_parents
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import KINDS, frustum, ordinary
 from groundwork.host.machine import instruction_set
+from tests.workloads.splat_scenes import KINDS, frustum, ordinary
 
 ROOT = Path(__file__).resolve().parents[1]
 Results = list[Tensor]

@@ -9,7 +9,7 @@ from rasterizer_tools import activated, few, ops, render, scene_arguments
 from torch import Tensor, autograd, func
 from torch.autograd import forward_ad
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 RAW, SIZE = few(dtype=torch.float32)
 SPLATS, CAMERA = activated(RAW), settings(**SIZE)

@@ -27,8 +27,8 @@ from tqdm import tqdm
 from benchmarks.accuracy.splat_shapes import Histogram, Sorted, Splats, axes_of, cells, seen
 from benchmarks.accuracy.trained_models import TrainedModel, model_parser, trained
 from benchmarks.harness.measuring import chosen_device, describe, print_table
-from benchmarks.workloads.stability_cases import CASES, Case
 from splatting.records.figures import save_figure
+from tests.workloads.stability_cases import CASES, Case
 from utils.system_utils import UserError, run_cli
 
 SHARES = (0.001, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0)

@@ -22,8 +22,8 @@ from tqdm import tqdm
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, ORACLE, Backend, kernels, run
 from benchmarks.harness.calls import Calls
 from benchmarks.harness.measuring import cpu_milliseconds, describe, gpu_milliseconds, print_table
-from benchmarks.workloads.splat_scenes import KINDS
-from benchmarks.workloads.stability_cases import Problem, all_stiff
+from tests.workloads.splat_scenes import KINDS
+from tests.workloads.stability_cases import Problem, all_stiff
 from utils.system_utils import run_cli
 
 TIMED_SIZES = {"ordinary": (200_000, 1200, 900), "needles": (20_000, 1200, 900), "huge and tiny": (3_000, 1200, 900)}

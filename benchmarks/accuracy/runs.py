@@ -7,9 +7,9 @@ import torch
 from diff_gaussian_rasterization import rasterize, reference
 from torch import Tensor
 
-from benchmarks.workloads import textbook
-from benchmarks.workloads.splat_scenes import on_device
-from benchmarks.workloads.stability_cases import Problem
+from tests.workloads import textbook
+from tests.workloads.splat_scenes import on_device
+from tests.workloads.stability_cases import Problem
 from utils.system_utils import compute_device
 
 PLANES = ("color", "inverse_depth", "transmittance")

@@ -28,7 +28,7 @@ from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CUDA_FLOAT, ORACLE, TEXTBOOK, Backend, kernels, run
 from benchmarks.harness.measuring import cpu_milliseconds, describe, print_table
-from benchmarks.workloads.stability_cases import CASES, PLAIN, Case, Problem
+from tests.workloads.stability_cases import CASES, PLAIN, Case, Problem
 from utils.system_utils import run_cli
 
 PARTS = ("ordinary", "stiff")

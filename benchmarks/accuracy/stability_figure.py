@@ -20,8 +20,8 @@ from tqdm import tqdm
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK
 from benchmarks.accuracy.stability import ROUNDING, Judged, Result
 from benchmarks.harness.measuring import describe
-from benchmarks.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
 from splatting.records.figures import save_figure
+from tests.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
 from utils.system_utils import run_cli
 
 TEXTBOOK_DOUBLE = TEXTBOOK._replace(name="textbook float64", dtype=torch.float64)

@@ -26,10 +26,10 @@ from tqdm import tqdm
 
 from arguments import OptimizationParams
 from benchmarks.harness.measuring import describe, print_table
-from benchmarks.workloads import textbook
-from benchmarks.workloads.stability_cases import Parameters
-from benchmarks.workloads.stiff_trainings import EXTENT, HEIGHT, KINDS, VIEWS, WIDTH, Cameras, draw, problem
 from splatting.records.figures import save_figure
+from tests.workloads import textbook
+from tests.workloads.stability_cases import Parameters
+from tests.workloads.stiff_trainings import EXTENT, HEIGHT, KINDS, VIEWS, WIDTH, Cameras, draw, problem
 from utils.loss_utils import photometric_loss
 from utils.system_utils import run_cli
 

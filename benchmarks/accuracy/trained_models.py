@@ -11,10 +11,10 @@ from torch import Tensor
 
 from arguments import ModelParams, PipelineParams, read_cfg_args
 from benchmarks.harness.measuring import add_device
-from benchmarks.workloads.splat_scenes import COLUMNS, PARAMETERS, on_device, settings
 from gaussian_renderer import rasterizer_settings
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved, read_model
+from tests.workloads.splat_scenes import COLUMNS, PARAMETERS, on_device, settings
 from utils.system_utils import UserError
 
 _WIDTH, _HEIGHT, _MADE = 800, 533, 8  # of cameras for a model that has none: px, px, count

@@ -9,7 +9,7 @@ from diff_gaussian_rasterization.ops import scene_arguments
 from diff_gaussian_rasterization.scene import GRADIENTS, draw
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import PARAMETERS, SplatScene
+from tests.workloads.splat_scenes import PARAMETERS, SplatScene
 
 OPS = torch.ops.diff_gaussian_rasterization
 TILE = 16  # pixels

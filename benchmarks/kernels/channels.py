@@ -21,7 +21,7 @@ from benchmarks.harness.measuring import (
     peak_mib,
     print_table,
 )
-from benchmarks.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from tests.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum, in_morton_order
 from utils.system_utils import run_cli
 
 _REPEATS = 5  # on a CPU

@@ -34,7 +34,9 @@ from benchmarks.harness.measuring import (
     peak_mib,
     print_table,
 )
-from benchmarks.workloads.splat_scenes import (
+from gaussian_renderer import rasterizer_settings, render
+from scene.saved_model import load_saved
+from tests.workloads.splat_scenes import (
     COLUMNS,
     CPU_WORKLOADS,
     GPU_WORKLOADS,
@@ -43,8 +45,6 @@ from benchmarks.workloads.splat_scenes import (
     SplatScene,
     frustum,
 )
-from gaussian_renderer import rasterizer_settings, render
-from scene.saved_model import load_saved
 from utils.system_utils import UserError, run_cli
 
 CPU_STAGES = ("project", "bin", "blend", "blend_rows", "rows_vjp")

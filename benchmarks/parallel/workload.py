@@ -7,11 +7,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import FOV, GPU_WORKLOADS, Draw, frustum, model_rows
 from groundwork.ranks.rows import bound
 from scene.cameras import Camera
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo
+from tests.workloads.splat_scenes import FOV, GPU_WORKLOADS, Draw, frustum, model_rows
 from utils.graphics_utils import focal2fov, fov2focal
 
 VIEWS = 8

@@ -15,7 +15,7 @@ from diff_gaussian_rasterization.gsplat import rasterization as ours
 from torch import Tensor
 
 from benchmarks.harness.measuring import describe, gpu_milliseconds, peak_mib, print_table
-from benchmarks.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from tests.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
 from utils.system_utils import UserError, run_cli
 
 _MOST = 0.999

@@ -18,7 +18,7 @@ from diff_gaussian_rasterization.gsplat import rasterization as ours
 from torch import Tensor
 
 from benchmarks.harness.measuring import REPEATS, describe, gpu_time, print_table
-from benchmarks.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from tests.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
 from utils.system_utils import UserError, run_cli
 
 Image = Callable[[], Tensor]  # (H, W, 3)

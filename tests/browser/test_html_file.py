@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 from gaussians import pipeline
+from html_page import Page as HtmlPage
 from html_scene import FOV, SIZE, balls, cameras
 from room_scene import HALF, STEP, room
 from room_scene import cameras as in_room
 from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
-from test_html_export import Page as HtmlPage
 
 from applications.export.html import write_html
 from applications.export.walking import EYES, solid_of

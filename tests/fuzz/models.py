@@ -10,11 +10,11 @@ from rasterizer_tools import render
 from small_splats import empty_spz, splats
 
 from applications.export.formats import format_of
-from benchmarks.workloads.splat_scenes import settings
 from fuzz.damage import changed, damaged, damaged_text
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
 from scene.splats.reading import read_splats
+from tests.workloads.splat_scenes import settings
 
 _TENSORS = (
     *(torch.zeros(0), torch.zeros(5), torch.zeros(5, 3, dtype=torch.float64), torch.zeros(5, 1, 3), torch.tensor(3.0)),

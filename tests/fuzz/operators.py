@@ -11,7 +11,7 @@ from rasterizer_tools import few, ops, scene_arguments
 from simple_knn.backend import OPERATORS as knn
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import on_device, settings
+from tests.workloads.splat_scenes import on_device, settings
 
 Call = tuple[Any, list]  # operator, arguments
 

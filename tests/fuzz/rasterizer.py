@@ -9,7 +9,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianR
 from rasterizer_tools import activated, few, keywords
 from torch import Tensor
 
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 _VALUES = (0.0, -1.0, 1e-45, 1e-20, 1e10, 1e20, 3e38, -3e38, math.nan, math.inf, -math.inf)
 _DTYPES = (torch.float16, torch.float64, torch.int64, torch.bool, torch.complex64)

@@ -23,7 +23,7 @@ from applications.evaluation.report import make_report
 from applications.evaluation.tables import result_tables
 from utils.system_utils import UserError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 
 
 def test_spread():

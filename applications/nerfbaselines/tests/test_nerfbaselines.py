@@ -18,7 +18,7 @@ from arguments.launch import launch_options
 from scene.readers.start_cloud import OWN_POINTS
 
 pycolmap = pytest.importorskip("pycolmap")
-SPEC = Path(__file__).resolve().parents[1] / "applications" / "nerfbaselines" / "spec.py"
+SPEC = Path(__file__).resolve().parents[3] / "applications" / "nerfbaselines" / "spec.py"
 
 
 class Cameras(SimpleNamespace):

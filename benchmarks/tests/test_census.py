@@ -10,7 +10,7 @@ from gaussians import model
 
 from benchmarks.accuracy import census
 from benchmarks.accuracy.splat_shapes import cells, seen
-from benchmarks.workloads.splat_scenes import settings
+from tests.workloads.splat_scenes import settings
 
 # On the axis at depths 5 and 2, behind the camera, and not finite; flat ones as seen by the camera.
 SCALES = torch.tensor([[0.5, 0.004, 0.1], [0.2, 0.2, 0.016], [1, 1, 1], [1, 1, 1]])

@@ -49,7 +49,7 @@ def _rows(said: str, first: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
 
 
-@pytest.mark.parametrize("path", sorted((Path(__file__).parents[1] / "benchmarks/sets").glob("*.json")), ids=str)
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "benchmarks/sets").glob("*.json")), ids=str)
 def test_sets_are_options_of_training(path):
     assert read_configs(path, train.parse)
 

@@ -1,8 +1,8 @@
 """Stiff and extreme cases for the rasterizer: scene, camera, the largest error allowed, and the reason for that bound.
 
 Each scene has ordinary Gaussians and some of the case's kind, which are called stiff. If the camera is the extreme
-part, all Gaussians count as stiff. benchmarks/accuracy/stability.py measures the cases; tests/test_stability.py holds
-them to their bounds.
+part, all Gaussians count as stiff. benchmarks/accuracy/stability.py measures the cases; its test holds them to their
+bounds.
 """
 
 import math
@@ -14,8 +14,8 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
 from torch import Generator, Tensor
 
-from benchmarks.workloads.splat_scenes import PARAMETERS, frustum, settings
-from benchmarks.workloads.textbook import covariance_of
+from tests.workloads.splat_scenes import PARAMETERS, frustum, settings
+from tests.workloads.textbook import covariance_of
 
 WIDTH, HEIGHT = 75, 53  # no multiple of the tile
 ORDINARY = 40  # Gaussians

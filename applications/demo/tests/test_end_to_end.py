@@ -18,7 +18,7 @@ from applications.demo.make_scene import make_scene
 pytest.importorskip("diff_gaussian_rasterization", reason="the extensions are not built: make test")
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 ITERATIONS = 300
 VIEWS = 36
 HELD_OUT = [0, 8, 16, 24, 32]

@@ -1,6 +1,7 @@
 """Fixtures that several test files share."""
 
 import os
+import re
 import shutil
 import signal
 import sys
@@ -21,10 +22,40 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of programs that a test starts
 torch.set_num_threads(1)
 
 
+ROOT = Path(__file__).resolve().parent
+_OF_COMMAND = {name: name for name in ("convert", "doctor", "export")} | {"full_eval": "evaluation", "view": "viewer"}
+_USED = re.compile(rf"^(?:from|import) (applications\.\w+|benchmarks|{'|'.join(_OF_COMMAND)})\b", re.MULTILINE)
+
+
+def _rooms(path: Path) -> set[str]:
+    """The applications, and benchmarks, that a test imports, also by helpers of tests."""
+    found, files, seen = set(), [path], set()
+    while files:
+        text = (file := files.pop()).read_text(encoding="utf-8")
+        seen.add(file)
+        found |= {f"applications.{_OF_COMMAND[name]}" if name in _OF_COMMAND else name for name in _USED.findall(text)}
+        helpers = {ROOT / "tests" / f"{name}.py" for name in re.findall(r"(?m)^from (\w+) import", text)}
+        files += [helper for helper in helpers - seen if helper.is_file()]
+    return found
+
+
+def pytest_ignore_collect(collection_path: Path) -> bool | None:
+    """Leave out a test that imports an application or benchmarks, if that folder was deleted.
+
+    GS_TESTS=applications leaves out all others: what `make check-core` runs.
+    """
+    if collection_path.suffix != ".py":
+        return None
+    rooms = _rooms(collection_path)
+    deleted = any(not ROOT.joinpath(*room.split(".")).is_dir() for room in rooms)
+    of_core = not rooms and ROOT / "tests" in collection_path.parents
+    return True if deleted or (of_core and os.environ.get("GS_TESTS") == "applications") else None
+
+
 @pytest.fixture(scope="session")
 def shared_dir() -> Path:
     """Folder with real scenes and models: $GS_SHARED, or `shared` beside the repository; skips if it is missing."""
-    folder = Path(os.environ.get("GS_SHARED") or Path(__file__).resolve().parents[2] / "shared")
+    folder = Path(os.environ.get("GS_SHARED") or Path(__file__).resolve().parents[1] / "shared")
     if not (folder / "scenes").is_dir():
         pytest.skip(f"no real scenes in {folder}; set GS_SHARED")
     return folder

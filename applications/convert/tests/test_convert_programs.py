@@ -21,7 +21,7 @@ from applications.convert.programs import refuse_while_working, run_programs
 from applications.convert.stages import Stage, StageRecord
 from utils.system_utils import UserError
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[3]
 SETTINGS = Settings("OPENCV", 8192, "exhaustive", "incremental", no_gpu=True)
 
 

@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from html_page import Page
 from html_scene import CENTRE, UP, balls, cameras
-from test_html_export import Page
 
 from applications.export.html import write_html
 from applications.export.notes import Note, Notes, read_notes

@@ -29,7 +29,7 @@ from scene.with_splats import model_of
 from utils.system_utils import compute_device
 
 pytestmark = pytest.mark.slow
-FOREIGN = Path(__file__).parent / "foreign"
+FOREIGN = Path(__file__).parents[3] / "tests" / "foreign"
 FLOAT, COMPRESSED = 60, 35  # dB that a format keeps at least
 COUNT = 512  # as many as SOG has clusters for their SH bands, so that its loss does not hang on which ones it merges
 

@@ -12,9 +12,9 @@ import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, rasterize
 from torch import Generator, Tensor
 
-from benchmarks.workloads.splat_scenes import frustum, settings
-from benchmarks.workloads.stability_cases import Parameters, normal, placed, uniform
 from scene.readers.info import origin_near
+from tests.workloads.splat_scenes import frustum, settings
+from tests.workloads.stability_cases import Parameters, normal, placed, uniform
 
 WIDTH, HEIGHT, COUNT = 64, 48, 200
 VIEWS, HELD_OUT, EXTENT = 8, 4, 2.0  # extent: about 1.1 times the cameras' largest distance from their mean

@@ -1,4 +1,4 @@
-"""Stiff and extreme cases, each held to its own bound (benchmarks/workloads/stability_cases.py has the reasons)."""
+"""Stiff and extreme cases, each held to its own bound (tests/workloads/stability_cases.py has the reasons)."""
 
 import functools
 import sys
@@ -12,8 +12,8 @@ from rasterizer_tools import gradients, leaves, one_splat, render
 from benchmarks.accuracy import stability
 from benchmarks.accuracy.runs import CPU_FLOAT, TEXTBOOK, kernels
 from benchmarks.accuracy.stability import Judged, beyond
-from benchmarks.workloads.splat_scenes import settings
-from benchmarks.workloads.stability_cases import CASES, Case, long_needles
+from tests.workloads.splat_scenes import settings
+from tests.workloads.stability_cases import CASES, Case, long_needles
 
 BY_NAME = {case.name: case for case in CASES}
 

@@ -34,7 +34,7 @@ from splatting.records.renders import GAIN, ComparedViews
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 MACHINE = {
     "commit": "abc", "cpu": "some CPU", "gpu": None, "instruction_set": "avx2", "packages": {"torch": "2"},
     "python": "3.11", "threads": 2,

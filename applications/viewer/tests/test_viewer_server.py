@@ -128,7 +128,7 @@ def test_a_taken_port_is_passed_over_and_told(capfd):
 
 def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert f'"viewer": ["{servers.VISER}"]' in (Path(__file__).parents[1] / "setup.py").read_text()
+    assert f'"viewer": ["{servers.VISER}"]' in (Path(__file__).parents[3] / "setup.py").read_text()
     with pytest.raises(UserError, match=f"pip install {servers.VISER}"):
         servers.check_port(8080)
     servers.check_port(None)

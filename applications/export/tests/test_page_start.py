@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from gaussians import pipeline
+from html_page import Page
 from html_scene import FOV, SIZE, balls, cameras
 from PIL import Image
-from test_html_export import Page
 
 import export
 import train
