@@ -31,7 +31,7 @@ def alone(once) -> Path:
         ignored = shutil.ignore_patterns(*LEFT_OUT)
         shutil.copytree(ROOT, folder / "code", ignore=ignored)
         for name in DELETED:
-            shutil.rmtree(folder / "code" / name)
+            shutil.rmtree(folder / "code" / name, ignore_errors=True)
 
     return once("core_alone", copy) / "code"
 

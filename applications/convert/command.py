@@ -40,11 +40,10 @@ from applications.convert.programs import refuse_while_working
 from applications.convert.report import lens_words, report_inputs, summary
 from applications.convert.video import FRAMES_MISSING, NOTE, report_entries, taken_frames, video_lines
 from arguments import OptionParser
-from groundwork.host import torchrun
 from groundwork.host.listing import some
 from groundwork.host.start import typed_command
-from scene.checks.conversion import stages_of, state_of
-from scene.readers.scene_folder import WORK, find_capture, is_apart, is_scene
+from scene.checks.conversion import awaits_conversion, stages_of, state_of
+from scene.readers.scene_folder import WORK, find_capture, is_scene
 from utils.system_utils import UserError
 
 _NAMING = ("poses", "mask_path")  # options that name a file
@@ -141,7 +140,7 @@ def convert_first(source: str) -> None:
     Do nothing with any other folder. The photos are in its sub-folder `input`, or directly in it.
     """
     folder = Path(source)
-    if not folder.is_dir() or torchrun.size() > 1:
+    if not awaits_conversion(folder):
         return
     found = find_capture(folder.absolute())
     words, begun = ["--video", *map(str, found.videos)] if found.is_video else [], None
@@ -149,12 +148,10 @@ def convert_first(source: str) -> None:
         there = f"; to train what is there, remove {folder / WORK}" if is_scene(folder) else ""
         print(f"a conversion of {folder} was not finished: finishing it first{there}")
         begun = _begun_options(folder)
-    elif is_apart(folder) and (found.photos or found.videos or os.path.lexists(folder / "input")):
+    else:
         print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
         if found.is_video and found.photos:
             print(f"taking frames of {some([path.name for path in found.videos])}, which is more than the photos")
-    else:
-        return
     main(["-s", str(folder.absolute()), *(words if begun is None else ())], **begun or {})
 
 

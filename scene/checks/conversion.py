@@ -7,8 +7,9 @@ from typing import Any
 
 from groundwork.files.json_files import read_json
 from groundwork.finding import Finding, fine, note
+from groundwork.host import torchrun
 from groundwork.host.listing import some
-from scene.readers.scene_folder import REPORT, WORK, find_capture
+from scene.readers.scene_folder import REPORT, WORK, find_capture, is_apart, is_scene
 
 REGISTERED = 0.9  # share of the photos that a good conversion places
 
@@ -33,6 +34,17 @@ def stages_of(source: str | os.PathLike) -> dict[str, Any]:
 def is_unfinished(source: str | os.PathLike) -> bool:
     """Return True if a conversion was begun in a folder, and ended before its last stage."""
     return bool(found := stages_of(source)) and not found.get("capture", {}).get("done")
+
+
+def awaits_conversion(source: str | os.PathLike) -> bool:
+    """Return True for a folder of photos or videos without cameras, and for one whose conversion ended early."""
+    folder = Path(source)
+    if not folder.is_dir() or torchrun.size() > 1 or (is_scene(folder) and not is_unfinished(folder)):
+        return False
+    if stages_of(folder):
+        return True
+    found = find_capture(folder.absolute())
+    return is_apart(folder) and bool(found.photos or found.videos or os.path.lexists(folder / "input"))
 
 
 def changed_photos(source: str | os.PathLike) -> str | None:

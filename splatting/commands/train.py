@@ -14,8 +14,7 @@ import torch
 from arguments import write_cfg_args, write_model_json
 from arguments.launch import launch_options, training_parser
 from groundwork.applications import application
-from scene.checks.conversion import is_unfinished
-from scene.readers.scene_folder import is_scene
+from scene.checks.conversion import awaits_conversion
 from splatting.agreement import agree_on_options
 from splatting.events import summary_writer
 from splatting.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
@@ -102,7 +101,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
-    if dataset.source_path and (is_unfinished(dataset.source_path) or not is_scene(dataset.source_path)):
+    if dataset.source_path and awaits_conversion(dataset.source_path):
         application("convert", "command").convert_first(dataset.source_path)
     if args.advise or args.options == "auto":
         given = sys.argv[1:] if argv is None else argv
