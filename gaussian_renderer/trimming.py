@@ -76,23 +76,23 @@ def search_unseen(
     """
     keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
     shards = gaussians.shards
-    search = Search(keep, faint=shards.marked(~keep))
+    search = Search(keep, faint=shards.count_marked(~keep))
     most, search.views = iterations / ITERATIONS_PER_VIEW, fewest_views(cameras)
     if search.views > most:
         search.end = TOO_LONG
         return search
     seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
     # To find neighbours loads SciPy, which takes longer than the search of most models.
-    enough = shards.marked(keep & ~seen) >= WORTH * gaussians.gaussian_count
+    enough = shards.count_marked(keep & ~seen) >= WORTH * gaussians.gaussian_count
     pairs = walk(cameras, most)[0] if enough else []
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
     total = len(FRACTIONS) * len(pairs)
     for camera in Bar(walks, desc="Looking between", total=total, unit="view", leave=False, disable=not total):
-        if shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
+        if shards.count_marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
             break
         seen |= decisive_for(camera, gaussians, pipe)
         search.views += 1
-    few = shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count
+    few = shards.count_marked(keep & ~seen) < WORTH * gaussians.gaussian_count
     search.end = FEW if few else DONE
     search.keep = keep if few else keep & seen
     return search
@@ -116,9 +116,9 @@ def trim(
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     search = Search(every) if keep_unseen else search_unseen(gaussians, cameras, pipe, iterations)
     shards = gaussians.shards
-    if not shards.marked(search.keep):  # never an empty model
+    if not shards.count_marked(search.keep):  # never an empty model
         search = Search(every, end=FEW)
-    search.unseen = shards.marked(~search.keep)
+    search.unseen = shards.count_marked(~search.keep)
     kept = search.keep if search.unseen else slice(None)
     search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach(), shards, search.keep)
     degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(search.cut_bounds, prune_sh)

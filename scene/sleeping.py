@@ -102,7 +102,7 @@ class Sleeping:
         """Within `flushed_view`, what a checkpoint of the model lacks; None: nothing. Every rank must call it."""
         if self._asleep is None:
             return None
-        whole = self._gaussians.shards.whole
+        whole = self._gaussians.shards.gather_whole
         changed = {name: whole(self._asleep[name]) for name in ("awake", "taken")}
         return self._asleep | changed | {"rows": [whole(values) for values in self._asleep["rows"]]}
 

@@ -150,8 +150,8 @@ class View:
             return change(pixels.to(self.device, non_blocking=True))
 
         if source is None or at_hand(source):
-            return source and source.changed(on_device)
-        return self.images.changed(source, self._size, on_device)
+            return source and source.transformed(on_device)
+        return self.images.transformed(source, self._size, on_device)
 
     @property
     def images(self) -> ImageStore:

@@ -75,7 +75,9 @@ class Run:
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
         check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
-        self.start = self.group.shared(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+        self.start = self.group.broadcast_object(
+            folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations)
+        )
         check_native(dataset)  # before auto becomes native
         dataset = self.dataset = folder.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
@@ -239,7 +241,7 @@ class Run:
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = folder.continue_records(to, start, self.first_iteration)
         self.losses.mean = self.log.loss
-        self.clock = Stopwatch(joules_counter(self.group.everyone(nvml_name(self.device))))
+        self.clock = Stopwatch(joules_counter(self.group.all_gather_objects(nvml_name(self.device))))
         for opened in self.each("opened"):
             opened(self)
 

@@ -45,7 +45,7 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
-    monkeypatch.setattr(full_eval, "facts_asked", lambda: MACHINE)
+    monkeypatch.setattr(full_eval, "facts_from_process", lambda: MACHINE)
     for name in ("draw_curves", "draw_sizes"):
         monkeypatch.setattr(report_module, name, lambda *_: [])  # half a second each; see `figures`
 

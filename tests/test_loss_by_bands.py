@@ -103,7 +103,7 @@ def _shared() -> list[tuple[Tensor, ...]]:
         first, end = bands.pixels(here.rank)
         view.color[:, first:end], view.inverse_depth[:, first:end] = image[:, first:end], photo[:1, first:end]
         color = surroundings(view).color.clone().requires_grad_()
-        loss, l1 = photometric_loss_by_bands(color, photo, 0.2, (first, end), here.added)
+        loss, l1 = photometric_loss_by_bands(color, photo, 0.2, (first, end), here.all_reduce_sum)
         (0.7 * loss).backward()
         whole_image(view)
         found.append((loss.detach(), l1, color.grad[:, first:end], view.color, view.inverse_depth))
@@ -130,7 +130,7 @@ class _Others(Ranks):
     def __init__(self, rects: list[Tensor], height: int = 97) -> None:
         self._rects, self._height = rects, height
 
-    def table(self, values: Tensor) -> Tensor:
+    def all_gather(self, values: Tensor) -> Tensor:
         others = [row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects[1:]]
         widths = torch.stack((values[0], *others))
         return torch.stack((widths, values[1] * torch.tensor([[1], [0], [0]])), 1)

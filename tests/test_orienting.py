@@ -100,7 +100,7 @@ def converted(folder: Path, turns: np.ndarray, places: np.ndarray, exifs=None) -
 def oriented(layout: Layout) -> tuple[Similarity, dict]:
     orient(layout)
     record = read_orientation(layout.scene)
-    return Similarity.of(record, "the record"), record
+    return Similarity.read(record, "the record"), record
 
 
 def test_a_tilted_scene_without_exif_data_becomes_level_in_its_own_unit(tmp_path):
@@ -109,7 +109,7 @@ def test_a_tilted_scene_without_exif_data_becomes_level_in_its_own_unit(tmp_path
     down = similarity.rotation @ TILT @ [0, 1, 0]
     np.testing.assert_allclose(down, [0, 1, 0], atol=2e-3)
     assert similarity.scale == 1 and record["unit"] == "scene" and "latitude" not in record
-    np.testing.assert_allclose(np.median(similarity.points(UNIT * places @ TILT.T + SHIFT), axis=0), 0, atol=1e-9)
+    np.testing.assert_allclose(np.median(similarity.transform(UNIT * places @ TILT.T + SHIFT), axis=0), 0, atol=1e-9)
     assert "horizons of 12 photos; no scale" in said_of(layout)[0]
 
 
@@ -129,7 +129,7 @@ def test_gps_gives_metres_and_north(tmp_path, lost):
     assert record["unit"] == "metre" and record["gps_photos"] == COUNT - lost
     assert similarity.scale * UNIT == pytest.approx(1, rel=0.02)  # 1 m / (30 m * sqrt(9)), twice
     np.testing.assert_allclose(similarity.rotation @ TILT, np.eye(3), atol=0.03)
-    moved = similarity.points(UNIT * places @ TILT.T + SHIFT)
+    moved = similarity.transform(UNIT * places @ TILT.T + SHIFT)
     middle = np.median(places, axis=0)
     np.testing.assert_allclose(moved, places - middle, atol=1.5)
     here = gps_of(middle[None])[0]
@@ -186,7 +186,7 @@ def test_flights_are_level_and_in_metres_or_say_that_they_are_not(
     assert (record["unit"] == "metre") == (how != "no")
     assert how == "no" or abs(scaled) < max(0.01, 2 * record["scale_error"])
     if known and how != "no":
-        there = similarity.points(UNIT * places @ TILT.T + SHIFT)
+        there = similarity.transform(UNIT * places @ TILT.T + SHIFT)
         earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
         east_north = earth.ellipsoid_to_enu(gps_of(places, at), *similarity.place)[:, :2]
         np.testing.assert_allclose(there[:, ::2], east_north, atol=4)

@@ -14,7 +14,7 @@ from test_house import ROOT, _module, _python, _tree
 
 from applications.evaluation.stages import _remove_stop
 from applications.export.sog import PROGRAM
-from groundwork.files.ours import digest_of, is_ours, write_picture
+from groundwork.files.ours import folder_digest, is_ours, write_picture
 from groundwork.host.programs import find_program
 from utils.system_utils import UserError
 
@@ -37,7 +37,7 @@ MAY = {
     "applications.convert.video._filters": "the same",
     "applications.convert.video.find_streams": "the same",
     "applications.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
-    "groundwork.host.machine.facts_asked": SELF,
+    "groundwork.host.machine.facts_from_process": SELF,
     "applications.doctor.advice._trained": SELF,
     "applications.evaluation.child.run_child": SELF,
     "splatting.records.curve_recorder.begin": SELF,
@@ -171,7 +171,7 @@ def test_a_folder_is_ours_by_its_files_and_its_owner(tmp_path):
     folder = tmp_path / "made"
     (folder / "deep").mkdir(parents=True)
     (folder / "deep" / "a").write_text("a")
-    named = folder.rename(tmp_path / f"tiles-{digest_of(folder, 'a.json')}")
+    named = folder.rename(tmp_path / f"tiles-{folder_digest(folder, 'a.json')}")
     assert is_ours(named, "a.json") and not is_ours(named, "b.json")
     (named / "deep" / "mine").touch()
     assert not is_ours(named, "a.json")

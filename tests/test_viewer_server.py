@@ -420,9 +420,9 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
         assert client.until("NotificationShowMessage")["props"]["title"] == "As before"
     page.stop()
     assert recorded_similarity(str(tmp_path / "out"), "")["similarity"] == record
-    found = Similarity.of(record, "here").from_local(np.array([10.0, 0, 0]))
+    found = Similarity.read(record, "here").from_local(np.array([10.0, 0, 0]))
     assert found.metric and found.scale == pytest.approx(2.5, rel=1e-2)
-    moved = found.points(places)
+    moved = found.transform(places)
     np.testing.assert_allclose(moved[:3, 1], 0, atol=0.03)
     assert moved[3, 1] == pytest.approx(-2.5, abs=0.05)  # above
     assert moved[1, 0] > moved[2, 0] and moved[1, 2] == pytest.approx(moved[2, 2], abs=0.03)  # the front is along x

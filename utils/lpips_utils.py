@@ -23,7 +23,7 @@ from unittest import mock
 import torch
 from torch import library, nn
 
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from groundwork.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
@@ -159,7 +159,7 @@ def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
 def _checked(file: Path, digest: str, remedy: str) -> Path:
     """The file, whose SHA-256 begins with `digest`; UserError if it does not, or if there is none."""
     try:
-        found = hashlib.sha256(plain(file).read_bytes()).hexdigest()
+        found = hashlib.sha256(plain_path(file).read_bytes()).hexdigest()
     except OSError as error:
         raise UserError(f"cannot read {file} ({error.strerror}); {remedy}") from error
     if not found.startswith(digest):

@@ -11,8 +11,8 @@ from groundwork.files.writing import atomic_write, mkdir_p, temporary_folder, wr
 from groundwork.host import start, torchrun
 from groundwork.host.errors import UserError, first_line
 from groundwork.host.interrupt import Terminated, let_signals_end
-from groundwork.host.machine import compute_device, without_code
-from groundwork.host.memory import is_out_of_memory, shortage
+from groundwork.host.machine import compute_device, missing_code_message
+from groundwork.host.memory import describe_shortage, is_out_of_memory
 
 __all__ = [
     "Terminated",
@@ -41,7 +41,7 @@ def run_cli(main: Callable[[], object], several: bool = False) -> None:
     Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`). An
     output that cannot be written (disk full) exits 2, and one that is closed does not matter.
     """
-    start.imported()
+    start.after_imports()
     try:
         status = _status(main) if torchrun.size() == 1 else _status_of_several(main, several)
         sys.stdout.flush()  # now, while a broken pipe can still be caught
@@ -102,11 +102,11 @@ def _outcome(main: Callable[[], object]) -> tuple[int, str]:
     except UserError as error:
         return 2, f"error: {error}"
     except (MemoryError, RuntimeError) as error:
-        if said := without_code(error):
+        if said := missing_code_message(error):
             return 2, f"error: {said}"
         if not is_out_of_memory(error):
             raise
-        reason = f"error: ran out of memory ({shortage(error, compute_device())})"
+        reason = f"error: ran out of memory ({describe_shortage(error, compute_device())})"
         return 2, f"{reason}; lower --resolution (-r), or free memory that other programs use"
     except Terminated:
         return 143, "terminated"

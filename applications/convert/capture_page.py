@@ -28,7 +28,7 @@ from applications.convert.layout import Layout, image_names
 from applications.convert.mapping import name_of
 from applications.convert.report import summary
 from applications.convert.stages import Stage
-from groundwork.files.color_profiles import in_srgb
+from groundwork.files.color_profiles import to_srgb
 from groundwork.files.image_files import UNREADABLE, open_image
 from groundwork.files.json_files import read_json, write_json
 from groundwork.host.progress import in_threads
@@ -124,7 +124,7 @@ def _thumbnail(path: Path) -> str | None:
     try:
         with open_image(path) as image:
             image.draft("RGB", (2 * _THUMBNAIL, 2 * _THUMBNAIL))  # decodes a large JPEG at a fraction of its size
-            small = in_srgb(ImageOps.exif_transpose(image)).convert("RGB")
+            small = to_srgb(ImageOps.exif_transpose(image)).convert("RGB")
     except UNREADABLE:
         return None
     small.thumbnail((_THUMBNAIL, _THUMBNAIL))

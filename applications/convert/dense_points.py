@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from groundwork.files.color_profiles import in_srgb
+from groundwork.files.color_profiles import to_srgb
 from groundwork.files.image_files import open_image
 from groundwork.host.progress import Bar, in_threads
 
@@ -128,7 +128,7 @@ def _load(images: Mapping[str, Any], folder: Path, origin: np.ndarray, device: t
         scale = min(1.0, SIDE / max(photo.size))
         size = tuple(round(side * scale) for side in photo.size)
         photo.draft("RGB", size)
-        colors = np.asarray(in_srgb(photo).convert("RGB").resize(size))
+        colors = np.asarray(to_srgb(photo).convert("RGB").resize(size))
     intrinsics = torch.tensor(image.camera.calibration_matrix(), dtype=torch.float32)
     intrinsics[:2] *= torch.tensor([[size[0] / image.camera.width], [size[1] / image.camera.height]])
     pose = image.cam_from_world()

@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image, ImageOps
 
 from applications.convert.layout import Layout, image_names
-from groundwork.files.color_profiles import has_other_colors, in_srgb
+from groundwork.files.color_profiles import has_other_colors, to_srgb
 from groundwork.files.color_tags import mark_srgb
 from groundwork.files.image_files import SUFFIXES, UNREADABLE, open_image
 from groundwork.finding import Finding
@@ -215,7 +215,7 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
 def _save(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:
     """Save in sRGB, in the format of the photo `like` that the image was made from."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    image = in_srgb(image)
+    image = to_srgb(image)
     if profile := image.info.get("icc_profile"):
         options["icc_profile"] = profile
     written = _written(like)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from groundwork.files.color_tags import HDR, code_points
 from groundwork.files.image_files import HEIF_SUFFIXES, RAW_SUFFIXES, SUFFIXES, UNREADABLE, VIDEO_SUFFIXES, open_image
-from groundwork.files.plain_files import not_the_file, plain
+from groundwork.files.plain_files import describe_wrong_file, plain_path
 from groundwork.host.listing import some
 from scene.images.decode import picture_size
 from utils.system_utils import UserError
@@ -91,7 +91,7 @@ def _kind(path: Path, thorough: bool) -> _Kind:
     if not path.is_file():
         return _Kind("unknown", _LINK)
     try:
-        with open(plain(path), "rb") as file:
+        with open(plain_path(path), "rb") as file:
             head = file.read(16)
             brand = head[8:12] if head[4:8] == b"ftyp" else b""
     except OSError as error:
@@ -108,7 +108,7 @@ def _kind(path: Path, thorough: bool) -> _Kind:
 
 def _heif_kind(path: Path, thorough: bool) -> _Kind:
     """Of HEIC and AVIF, which are files of one container."""
-    if (points := code_points(plain(path), "HEIF")) and points[1] in HDR:
+    if (points := code_points(plain_path(path), "HEIF")) and points[1] in HDR:
         return _Kind("HEIF", _HDR)
     if not _is_whole(path):
         return _Kind("HEIF", _DAMAGED)
@@ -150,7 +150,7 @@ def _picture_kind(path: Path, thorough: bool) -> _Kind:
     except (*UNREADABLE, UserError):
         # Without `thorough`, the photos' own check says what is wrong with files that should be photos.
         if suffix in SUFFIXES:
-            other = not_the_file(path)
+            other = describe_wrong_file(path)
             return _Kind("unknown", (f"{other}: download it again" if other else _DAMAGED) if thorough else "")
         return _Kind("HEIF", _DAMAGED) if suffix in HEIF_SUFFIXES else _Kind("", "no picture")
     return _Kind("", "GIF, the format of animations") if kind == "GIF" else _Kind(kind, "")

@@ -32,7 +32,7 @@ from applications.evaluation.tables import MAIN, Table, gains_table, result_tabl
 from arguments import OptionParser
 from groundwork.files.folders import locked
 from groundwork.host.listing import markdown_table
-from groundwork.host.machine import facts_asked
+from groundwork.host.machine import facts_from_process
 from splatting.records.error_curve import peers_of
 from utils.system_utils import UserError, mkdir_p
 
@@ -171,7 +171,7 @@ def _carry_out(
     runs: Sequence[Run], args: Namespace, gpus: Sequence[str], failures: dict[Run, Failure], start: Start
 ) -> None:
     """Carry out every run; note and print a failure, and continue with the next run."""
-    facts = {} if args.skip_training else facts_asked()
+    facts = {} if args.skip_training else facts_from_process()
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from groundwork.files.json_files import read_json
-from groundwork.files.ours import digest_of, files_of, is_ours
+from groundwork.files.ours import folder_digest, is_ours, sorted_files
 from utils.system_utils import atomic_write, mkdir_p
 
 PLACE = "{folder}"  # stands for the name of the folder
@@ -34,7 +34,7 @@ def with_folder(path: Path, prefix: str) -> Iterator[Path]:
         yield folder
         text = (folder / path.name).read_text(encoding="utf-8")
         (folder / path.name).unlink()
-        final = path.parent / (prefix + digest_of(folder, path.name))
+        final = path.parent / (prefix + folder_digest(folder, path.name))
         temporary.write_text(text.replace(PLACE, final.name), encoding="utf-8")
         _put(folder, final)
     if earlier and earlier != final:
@@ -46,7 +46,7 @@ def _put(folder: Path, final: Path) -> None:
     if not final.exists():
         os.replace(folder, final)
         return
-    for file in files_of(folder):
+    for file in sorted_files(folder):
         target = final / file.relative_to(folder)
         if not (target.is_file() and filecmp.cmp(file, target, shallow=False)):
             mkdir_p(target.parent)

@@ -39,7 +39,7 @@ def check_upright(args: argparse.Namespace) -> None:
             "--upright needs a model folder (-m) of a scene that was oriented; run convert.py --orient on it, or leave "
             "--upright out"
         )
-    if not Similarity.of(record, f"orientation of {args.model_path}").upright:
+    if not Similarity.read(record, f"orientation of {args.model_path}").upright:
         raise UserError("--upright: convert.py --orient found no vertical of this scene; leave --upright out")
 
 
@@ -69,7 +69,7 @@ def moved_splats(splats: Splats, similarity: Similarity) -> Splats:
     enlargement = 2.0 ** np.ceil(np.log2(splats.enlargement / similarity.scale))
     return replace(
         rotated(splats, similarity.rotation),
-        means=similarity.points(splats.means).astype(np.float32),
+        means=similarity.transform(splats.means).astype(np.float32),
         log_scales=splats.log_scales + np.float32(np.log(similarity.scale)),
         enlargement=max(1.0, float(enlargement)),
         place=similarity.place,
@@ -79,7 +79,7 @@ def moved_splats(splats: Splats, similarity: Similarity) -> Splats:
 def moved_cameras(cameras: Sequence[Camera], similarity: Similarity) -> list[Camera]:
     """Copies of cameras that see moved splats as the cameras see the splats."""
     poses = poses_of(cameras)
-    places, turns = similarity.points(poses.positions), similarity.rotation @ poses.turns
+    places, turns = similarity.transform(poses.positions), similarity.rotation @ poses.turns
     twins = [copy.copy(camera) for camera in cameras]
     for twin, place, turn in zip(twins, places, turns, strict=True):
         twin.place(turn, -turn.T @ place)
@@ -106,7 +106,7 @@ class MovedPath:
         from scipy.spatial.transform import Rotation
 
         key = self.path.at(seconds)
-        place = self.similarity.points(np.array([key.position]))[0]
+        place = self.similarity.transform(np.array([key.position]))[0]
         turn = self.similarity.rotation @ Rotation.from_quat(key.wxyz, scalar_first=True).as_matrix()
         return keyframe(key.seconds, place, turn, key.fov)
 

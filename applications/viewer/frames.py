@@ -19,7 +19,7 @@ from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth, view_planes
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from gaussian_renderer.median_depth import median_at
-from groundwork.files.image_files import dimmed, to_bytes
+from groundwork.files.image_files import dim_masked, to_bytes
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from utils.image_utils import as_float
@@ -73,7 +73,7 @@ class Frames:
             target = as_float(camera.target(self._background(settings)))
             drawn = self._image(settings, camera, target)
             if (counts := self.masks(camera)) is not None:
-                target = dimmed(target, counts)
+                target = dim_masked(target, counts)
             self._compared = key, (target, *drawn)
         target, image, words = self._compared[1]
         if settings.comparison == views.BESIDE and settings.mode == views.COLOUR:

@@ -44,7 +44,7 @@ class Place:
     @property
     def unit(self) -> tuple[float, str]:
         """What a unit of the scene is, and of what."""
-        known = self.record and Similarity.of(self.record, "orientation")
+        known = self.record and Similarity.read(self.record, "orientation")
         return (known.scale, "m") if known and known.metric else (1.0, "units of the scene")
 
     def write(self, record: dict[str, Any]) -> list[Path]:
@@ -180,7 +180,7 @@ class MeasureTab:
         moved = {tool: None if (it := self._whole(tool)) is None else it + self._place.offset for tool in _POINTS}
         above = self._cameras.middle + self._place.offset
         record = measured_record(self._place.record, above, scale, moved[GROUND], moved[FRONT])
-        Similarity.of(record, "what was measured")  # a scale that no scene has
+        Similarity.read(record, "what was measured")  # a scale that no scene has
         files = self._place.write(record)
         self._show()
         return files

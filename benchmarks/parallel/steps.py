@@ -112,7 +112,7 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
     own["digest"] = digest(run.gaussians) if case["learn"] else ""
     own["memory"] = torch.cuda.mem_get_info()[1] if device.type == "cuda" else 0
     count = workload.gaussians
-    return case | {"name": str(workload), "gaussians": count, "by_rank": here.everyone(own)}
+    return case | {"name": str(workload), "gaussians": count, "by_rank": here.all_gather_objects(own)}
 
 
 def launch(case: dict[str, Any], limit: float) -> dict[str, Any] | None:

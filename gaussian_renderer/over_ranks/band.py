@@ -44,7 +44,7 @@ class View:
 
     @property
     def band(self) -> Band:
-        return Band(self.bands.pixels(self.ranks.rank), self.ranks.added)
+        return Band(self.bands.pixels(self.ranks.rank), self.ranks.all_reduce_sum)
 
 
 def draw_view(
@@ -84,7 +84,7 @@ def whole_image(view: View) -> View:
     rows = [bands.pixels(rank) for rank in range(ranks.size)]
     first, end = rows[ranks.rank]
     own = torch.cat((view.color, view.inverse_depth))[:, first:end].transpose(0, 1)
-    planes = ranks.gather(own, [end - first for first, end in rows]).transpose(0, 1).contiguous()
+    planes = ranks.all_gather_rows(own, [end - first for first, end in rows]).transpose(0, 1).contiguous()
     view.color, view.inverse_depth = planes[:3], planes[3:]
     return view
 
@@ -118,7 +118,7 @@ def camera_gradient(
     and what `gradient_rows` returns. blocks: how many each rank has, if this is known. Every rank must call it.
     """
     own = OPERATORS.camera_vjp(*scene, source, absolute)
-    return OPERATORS.sum_blocks(ranks.gather(own, blocks))
+    return OPERATORS.sum_blocks(ranks.all_gather_rows(own, blocks))
 
 
 def decisive_in(view: View) -> Tensor:

@@ -117,7 +117,7 @@ def find_bands(
     """
     widths = row_widths(rects, tile_counts, height)
     loads = torch.stack((widths, torch.zeros_like(widths) if processed is None else processed))
-    widths, processed = ranks.table(loads).sum(0).cpu()
+    widths, processed = ranks.all_gather(loads).sum(0).cpu()
     total = widths.cumsum(0)[:-1] + _PROCESSED_COST * processed[:-1] + _TILE_COST * tile_rows(width)
     ends = total.cumsum(0)
     shares = torch.arange(1, ranks.size) * int(ends[-1]) // ranks.size

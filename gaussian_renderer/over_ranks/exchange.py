@@ -42,7 +42,7 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     counts = OPERATORS.list_records(*reach)[0]
     empty = _EVEN - counts[:-1].sum(1).remainder(_EVEN)
     counts = torch.cat((counts, torch.cat((empty, empty.sum()[None])).int()[:, None]), 1)
-    every = ranks.agree(counts[:-1].sum(1))
+    every = ranks.all_gather_ints(counts[:-1].sum(1))
     sizes, received = every[ranks.rank], [numbers[ranks.rank] for numbers in every]
     _, gaussians, places, *records = OPERATORS.list_records(*reach, counts, *splats[:2], sum(sizes))
     # One message each, so that nothing has to be taken apart: a copy of all takes longer than three more messages.

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from groundwork.files.color_profiles import in_srgb
-from groundwork.files.image_files import UNREADABLE, eight_bits, open_image
+from groundwork.files.color_profiles import to_srgb
+from groundwork.files.image_files import UNREADABLE, open_image, to_eight_bits
 from groundwork.finding import Finding
 from groundwork.host.listing import some
 from scene.readers.info import CameraInfo, SceneInfo
@@ -119,8 +119,8 @@ def small(path: Path, side: int = _WIDTH) -> np.ndarray:
 def shrunk(image: Image.Image, mode: str, side: int) -> np.ndarray:
     """An image (H, W, channels) uint8 in sRGB and Pillow's `mode`, with at most `side` pixels a side."""
     image.draft("RGB", (side, side))  # decodes a large JPEG at a fraction of its size
-    pixels = in_srgb(image)
-    pixels = (eight_bits(pixels) if pixels.mode.startswith("I") else pixels).convert(mode)
+    pixels = to_srgb(image)
+    pixels = (to_eight_bits(pixels) if pixels.mode.startswith("I") else pixels).convert(mode)
     pixels.thumbnail((side, side))
     return np.asarray(pixels)
 

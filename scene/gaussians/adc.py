@@ -163,8 +163,8 @@ def _make_children(
     xyz, rotation = (rows[name][first : first + len(parents)] for name in ("xyz", "rotation"))
     shapes = xyz, gaussians.log_scales().index_select(0, parents), rotation
     if seed is None:
-        seed = gaussians.shards.ranks.shared(int(torch.randint(2**62, ())))
-    items = gaussians.shards.items(parents)
+        seed = gaussians.shards.ranks.broadcast_object(int(torch.randint(2**62, ())))
+    items = gaussians.shards.global_indices(parents)
     sampled = [
         rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)
         for child in range(count)
@@ -182,7 +182,7 @@ def append_rows(gaussians: GaussianParameters, rows: Rows, *origins: Tensor) -> 
     if gaussians.tmp_radii is not None:
         standard.append(gaussians.tmp_radii.index_select(0, torch.cat(origins)))
     gaussians.densification_postfix(*standard, **rows)
-    gaussians.shards.order(*map(gaussians.shards.items, origins))
+    gaussians.shards.order_appended(*map(gaussians.shards.global_indices, origins))
 
 
 @changes_rows
@@ -207,7 +207,7 @@ def densification_postfix(
     if gaussians.tmp_radii is not None:
         new = gaussians.tmp_radii.new_zeros(len(new_xyz)) if new_tmp_radii is None else new_tmp_radii
         gaussians.tmp_radii = torch.cat((gaussians.tmp_radii, new))
-    gaussians.shards.appended(len(new_xyz))
+    gaussians.shards.note_appended(len(new_xyz))
     gaussians._zero_statistics()
 
 
@@ -227,7 +227,7 @@ def prune_points(gaussians: GaussianParameters, mask: Tensor) -> None:
     if len(keep) == len(kept):
         return
     gaussians._take(gaussians._prune_optimizer(kept))
-    gaussians.shards.kept(keep)
+    gaussians.shards.note_kept(keep)
     for name in PER_ROW:
         values = getattr(gaussians, name, None)  # users delete those that they do not need
         if values is not None:

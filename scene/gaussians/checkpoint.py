@@ -68,7 +68,7 @@ def capture(gaussians: GaussianParameters) -> tuple:
     several processes, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
     """
     raw = {name: getattr(gaussians, a.field) for name, a in gaussians._attributes.items()}
-    gaussians.shards.match(gaussians.optimizer)
+    gaussians.shards.match_steps(gaussians.optimizer)
     state = State(
         gaussians.active_sh_degree,
         {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
@@ -77,7 +77,7 @@ def capture(gaussians: GaussianParameters) -> tuple:
         float(gaussians.spatial_lr_scale),
         gaussians.exposures.capture() if gaussians.exposures.trained else None,
     )
-    return pack(state.mapped(gaussians.shards.whole))
+    return pack(state.mapped(gaussians.shards.gather_whole))
 
 
 def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
@@ -86,7 +86,7 @@ def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_a
     A model without exposures takes those of the state, too; one that has them must have the same photos.
     UserError when the state was made with another maximal SH degree or does not fit together.
     """
-    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).mapped(gaussians.shards.own)
+    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).mapped(gaussians.shards.own_rows)
     gaussians.active_sh_degree = state.active_sh_degree
     gaussians.spatial_lr_scale = state.spatial_lr_scale
     gaussians.set_rows(state.rows)

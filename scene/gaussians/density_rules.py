@@ -126,7 +126,7 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
 def limit_growth(gradient: Tensor, threshold: float, most: int, shards: Shards = WHOLE) -> Tensor:
     """Zero the gradients of all candidates (>= threshold) except the `most` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
-    if shards.ranks.before(len(candidates))[1] <= most:
+    if shards.ranks.offset_and_total(len(candidates))[1] <= most:
         return gradient
     grow = candidates[shards.lowest(gradient[candidates], most, highest=True)]
     return gradient.index_fill(0, candidates, 0.0).index_copy_(0, grow, gradient[grow])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from groundwork.deterministic.portable_math import exp, log
 from groundwork.files.ply_header import header_lines
-from groundwork.files.unread import say_once, say_unread
+from groundwork.files.unread import note_once, note_unread
 from scene.gaussians.attributes import Rows
 
 _FILTER = "filter_3D"  # the width of a Gaussian's filter, which Mip-Splatting and what follows it leave to the renderer
@@ -28,18 +28,18 @@ def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, us
     names = set(vertices.dtype.names or ()) - set(used)
     if _FILTER in names and not vertices.dtype[_FILTER].hasobject and rows["scaling"].shape[1] == 3:
         names.remove(_FILTER)
-        say_once(
+        note_once(
             f"{path} has the 3D filter of Mip-Splatting ({_FILTER}), which is applied; its renders are right with "
             "--antialiasing"
         )
         widths = torch.from_numpy(np.asarray(vertices[_FILTER], np.float32).reshape(-1, 1).copy())
         opacity, scaling = _filtered(rows["opacity"], rows["scaling"], widths)
         rows = rows | {"opacity": opacity, "scaling": scaling}
-    say_unread(path, "ply", names)
+    note_unread(path, "ply", names)
     elements = {words[1] for line in header_lines(path) if len(words := line.split()) == 3 and words[0] == "element"}
-    say_unread(path, "ply elements", elements - {"vertex"})
+    note_unread(path, "ply elements", elements - {"vertex"})
     if any(name.startswith(_MOVING) for name in names) or any(name.startswith("delta_") for name in elements):
-        say_once(f"warning: {path} is a model that moves, of which only one state is drawn; some of it may look wrong")
+        note_once(f"warning: {path} is a model that moves, of which only one state is drawn; some of it may look wrong")
     return rows
 
 
@@ -69,10 +69,10 @@ def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:
         low, high = float(rows[part].min()), float(rows[part].max())
         if low >= 0 and (0 < high <= 1 or _NO_LOGIT < high < math.inf):
             found = f"{what} of {path} are from {low:.3g} to {high:.3g}"
-            say_once(f"warning: all {found}, so they may be no {form}; {remedy}")
+            note_once(f"warning: all {found}, so they may be no {form}; {remedy}")
     scales = rows["scaling"]
     if scales.min() >= 0 and scales.max() > 0 and float(scales.median().exp()) > _LARGE * _extent(rows["xyz"]):
-        say_once(f"warning: all scales of {path} are above 0, so they may be no logarithms; {remedy}")
+        note_once(f"warning: all scales of {path} are above 0, so they may be no logarithms; {remedy}")
 
 
 def _extent(points: Tensor) -> float:

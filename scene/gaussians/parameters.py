@@ -311,12 +311,12 @@ class GaussianParameters:
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
         self.columns = {}
-        self.shards = self.shards.of(len(self))
+        self.shards = self.shards.resized(len(self))
         self._zero_statistics()
 
     def take_whole(self, rows: Rows) -> None:
         """Do as set_rows with the rows of a whole model, of which this rank keeps its part."""
-        self.set_rows({name: self.shards.own(values) for name, values in rows.items()})
+        self.set_rows({name: self.shards.own_rows(values) for name, values in rows.items()})
 
     def _take(self, params: dict[str, Tensor]) -> None:
         """Set the tensors of these attributes; tensors of other names are not the table's."""

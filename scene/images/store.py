@@ -15,7 +15,7 @@ from torch import Tensor
 from groundwork.host.machine import threads
 from groundwork.host.memory import free_memory
 from groundwork.ranks.ranks import ALONE, Ranks
-from groundwork.ranks.shared_images import SharedImage, divided
+from groundwork.ranks.shared_images import SharedImage, share_images
 from scene.images.decode import decode
 
 GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
@@ -45,7 +45,7 @@ class InMemory:
 
     pixels: Tensor
 
-    def changed(self, change: Callable[[Tensor], Tensor]) -> "InMemory":
+    def transformed(self, change: Callable[[Tensor], Tensor]) -> "InMemory":
         """Another image, made of this one now."""
         return InMemory(change(self.pixels))
 
@@ -106,7 +106,7 @@ class ImageStore:
         self._planned = set(keys)
         if self.ranks.several:
             sizes = {key: _bytes(*key) for key in keys}
-            self._planned, self._shared = divided(sizes, self._own, self.device, self.ranks)
+            self._planned, self._shared = share_images(sizes, self._own, self.device, self.ranks)
         self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0
@@ -144,10 +144,10 @@ class ImageStore:
         key = _key(source, size)
         return self._shared[key].pixels if key in self._shared else self._own(key)
 
-    def changed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory:
+    def transformed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory:
         """An image made of another, of which the store keeps nothing: now, or by one process for all that share it."""
         shared = self._shared.get(_key(source, size))
-        return InMemory(change(self.get(source, size))) if shared is None else shared.changed(change)
+        return InMemory(change(self.get(source, size))) if shared is None else shared.transformed(change)
 
     def _own(self, key: Key) -> Tensor:
         picture = self._kept.get(key)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from scene.colmap_loader import Camera, Image, Points, qvec2rotmat, read_cameras, read_images, read_points
 from scene.images.find import find_images
 from scene.images.lens import Lens
@@ -51,7 +51,7 @@ def read_colmap(
     Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
     model_folder, model = find_model(folder)
-    say_unread(model_folder, "colmap", _side_files(model_folder))
+    note_unread(model_folder, "colmap", _side_files(model_folder))
     if (listed := model_folder / "test.txt").is_file():  # of the reference, whose train.py does not read it either
         refuse_rule(rule, listed)
     if not model.images:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from groundwork.files.image_files import UNREADABLE, open_image, plane_scale
-from groundwork.files.plain_files import plain, plain_text
+from groundwork.files.plain_files import plain_path, plain_text
 from groundwork.host.listing import some
 from groundwork.host.machine import threads
 from scene.images.decode import picture_size
@@ -240,7 +240,7 @@ def read_values(path: Path) -> np.ndarray:
 
 def _array(path: Path) -> np.ndarray:
     """The floats (H, W) of a .npy, which stay in the file. ValueError for other arrays."""
-    values = np.load(plain(path), mmap_mode="r", allow_pickle=False)
+    values = np.load(plain_path(path), mmap_mode="r", allow_pickle=False)
     if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f":
         raise ValueError("it is no array (height, width) of floats")
     return values

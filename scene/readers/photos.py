@@ -21,7 +21,7 @@ from PIL.PngImagePlugin import PngInfo
 from groundwork.files.color_tags import mark_srgb
 from groundwork.files.folders import cache_folder, remove_temporary_files
 from groundwork.files.image_files import UNREADABLE, open_image
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from groundwork.host.listing import some
 from groundwork.host.progress import in_threads
 from scene.images.decode import decode, picture_size, picture_sizes
@@ -217,7 +217,7 @@ def _turn(photo: Path) -> int | None:
 
 
 def _upright_path(photo: Path, folder: Path) -> Path:
-    digest = hashlib.blake2b(plain(photo).read_bytes(), digest_size=20, person=_UPRIGHT_FORMAT)
+    digest = hashlib.blake2b(plain_path(photo).read_bytes(), digest_size=20, person=_UPRIGHT_FORMAT)
     return folder / f"{digest.hexdigest()}.png"
 
 
@@ -300,7 +300,7 @@ def _key(photo: CameraInfo, version: str) -> str:
     for path in (photo.image_path, photo.mask.path if photo.mask else None):
         if path is not None:
             try:
-                content = plain(path).read_bytes()
+                content = plain_path(path).read_bytes()
             except OSError as error:
                 raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
             digest.update(len(content).to_bytes(8, "little") + content)

@@ -15,7 +15,7 @@ import numpy as np
 
 from groundwork.files.image_files import SUFFIXES
 from groundwork.files.json_files import read_json
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from groundwork.host.listing import some
 from scene.images.decode import picture_sizes
 from scene.images.find import FileIndex, find_images, find_in, find_listed, identity, other_folder
@@ -91,7 +91,7 @@ def read_poses(path: Path) -> list[Posed]:
     A message names the masks that the file gives, which nobody reads here.
     """
     content = _read(path)
-    say_unread(path, "transforms", {name for one in (content, *content["frames"]) for name in _MASKS if one.get(name)})
+    note_unread(path, "transforms", {name for one in (content, *content["frames"]) for name in _MASKS if one.get(name)})
     frames = enumerate(content["frames"], start=1)
     return [
         Posed(str(frame["file_path"]), *_pose(path, number, frame), partial(_lens, path, content, frame))
@@ -243,8 +243,8 @@ def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
     told = {name for frame in frames for name, value in frame.items() if name not in _READ and _tells(value)}
     if len({str(frame.get("time")) for frame in frames}) < 2:
         told.discard("time")  # the photos are of one moment
-    say_unread(path, "transforms", {name for name, value in content.items() if name not in _READ and _tells(value)})
-    say_unread(path, "frames", told)
+    note_unread(path, "transforms", {name for name, value in content.items() if name not in _READ and _tells(value)})
+    note_unread(path, "frames", told)
 
 
 def _tells(value: Any) -> bool:

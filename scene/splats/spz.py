@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundwork.files.plain_files import check_packed_rows
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
 from scene.splats.splats import Splats, from_axes, half_rotated, logits, opacities, selected
 from utils.system_utils import UserError, atomic_write
@@ -232,7 +232,7 @@ def _axes(records: bytes, header: _Header, path: str | os.PathLike) -> str:
         place += 8 + size
     if flags := header.flags & ~(_ANTIALIASED | _EXTENDED):
         others.append(f"flags 0x{flags:02X}")
-    say_unread(path, "spz", others)
+    note_unread(path, "spz", others)
     return axes
 
 

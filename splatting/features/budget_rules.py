@@ -29,7 +29,7 @@ def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     steps are long: with the parent's averages they would stay almost where they are.
     """
     count = len(parents)
-    if not gaussians.shards.ranks.anyone(count > 0):
+    if not gaussians.shards.ranks.any_rank(count > 0):
         return
     rows = gaussians.rows_at(parents)
     shapes = gaussians.log_scales(), gaussians.opacity_logits()
@@ -38,8 +38,8 @@ def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     children |= gaussians.raw_shapes(children["opacity"], children["scaling"])
     second = rows | {name: values[count:] for name, values in children.items()}
     gaussians._take(gaussians.cat_tensors_to_optimizer(second))
-    gaussians.shards.appended(count)
-    gaussians.shards.order(gaussians.shards.items(parents))
+    gaussians.shards.note_appended(count)
+    gaussians.shards.order_appended(gaussians.shards.global_indices(parents))
     gaussians._zero_statistics()
     for name, values in children.items():
         gaussians.raw(name)[parents] = values[:count]

@@ -79,7 +79,7 @@ def test_large_coordinates_lose_nothing():
     world = Similarity(TURN, 2.5, -2.5 * TURN @ (offset + 0.125))
     splats = replace(balls(degree=0), world_offset=tuple(offset))
     moved = moved_splats(splats, world.from_local(offset))
-    expected = world.points(splats.means.astype(np.float64) + offset)
+    expected = world.transform(splats.means.astype(np.float64) + offset)
     np.testing.assert_allclose(moved.means, expected, atol=2e-6)
     assert moved.world_offset == (0, 0, 0) and np.abs(moved.means).max() < 10
 
@@ -92,7 +92,7 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
     (tmp_path / "model.json").write_text(json.dumps({"similarity": record, "world_offset": [1.0, 2.0, 3.0]}))
     splats = replace(balls(), world_offset=(1.0, 2.0, 3.0))
-    moved = SOME.points(splats.means.astype(np.float64) + [1.0, 2.0, 3.0])
+    moved = SOME.transform(splats.means.astype(np.float64) + [1.0, 2.0, 3.0])
     for of_scene, options, is_moved in (
         (True, {}, True),
         (True, {"no_upright": True}, False),
@@ -108,7 +108,7 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     (tmp_path / "model.json").write_text(json.dumps({"similarity": unknown}))
     with pytest.raises(UserError, match="found no vertical"):
         check_upright(_args(tmp_path, upright=True))
-    found = Similarity.of(unknown, "it")
+    found = Similarity.read(unknown, "it")
     assert not moved_around(around(), found).upright and moved_around(around(), SOME).upright
 
 
@@ -144,7 +144,7 @@ def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, mon
         monkeypatch.setattr(sys, "argv", ["export.py", "-m", str(model), "--to", str(tmp_path / f"{name}.ply"), *more])
         export.main()
     plain, upright = (read_splats(tmp_path / f"{name}.ply") for name in ("plain", "upright"))
-    np.testing.assert_allclose(upright.means, SOME.points(plain.means), atol=1e-5)
+    np.testing.assert_allclose(upright.means, SOME.transform(plain.means), atol=1e-5)
     monkeypatch.setattr(export, "load", lambda *_: pytest.fail("this is refused before anything is loaded"))
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--no_upright"])
     with pytest.raises(UserError, match="contradict"):
@@ -162,7 +162,7 @@ def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scen
         export.main()
         written.append(read_splats(tmp_path / f"{name}.ply").means)
         (colmap_scene / "orientation.json").write_text(json.dumps(record))
-    np.testing.assert_allclose(written[1], SOME.points(written[0]), atol=1e-5)
+    np.testing.assert_allclose(written[1], SOME.transform(written[0]), atol=1e-5)
     assert "poses are not those" not in capsys.readouterr().err
     record = json.loads((model / "cameras.json").read_text())
     for entry in record:  # as if the scene had got other poses since
