@@ -10,13 +10,17 @@ from utils.system_utils import UserError
 
 
 @contextlib.contextmanager
-def memory_errors_explained(
+def explain_memory_errors(
     gaussians: GaussianModel,
     cameras: Sequence[Camera | MiniCam],
     remedy: str = "lower --resolution (-r)",
     what: str = "rendering",
 ) -> Iterator[None]:
-    """Replace an out-of-memory error by a UserError while these views are rendered. remedy: what takes less memory."""
+    """Replace an out-of-memory error in the block, which renders these views, by a UserError.
+
+    remedy: advice that saves memory, for the message.
+    what: the activity, for the message.
+    """
     try:
         yield
     except Exception as error:

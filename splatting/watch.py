@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gaussian_renderer import shown_by
+from gaussian_renderer import visible_mask
 from groundwork.host.listing import some
 from scene.cameras import Camera
 from scene.checks.points import OTHER_FORMS
@@ -100,7 +100,7 @@ def check_drawn(run: "Run") -> None:
     """Refuse a start that no view shows (UserError), as no step would change anything. Every rank calls it."""
     views = run.scene.getTrainCameras()
     for view in views:
-        if run.group.all_gather_host_ints(int(shown_by(view, run.gaussians, run.pipe).any())).any():
+        if run.group.all_gather_host_ints(int(visible_mask(view, run.gaussians, run.pipe).any())).any():
             return
     raise UserError(f"none of the {len(views)} training views shows any Gaussian of the start; {OTHER_FORMS}")
 

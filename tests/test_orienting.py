@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from applications.convert.georeference import level_up
 from applications.convert.layout import Layout
 from applications.convert.orienting import orient, said_of
-from gaussian_renderer.camera_paths.poses import facing
+from gaussian_renderer.camera_paths.poses import look_along
 from groundwork.files.similarity import Similarity, read_orientation
 from scene.images.exif import _gps, read_place
 from utils.system_utils import UserError
@@ -29,7 +29,7 @@ def ring(rolls=()) -> tuple[np.ndarray, np.ndarray]:
     """Turns (N,3,3) and places (N,3), metres, of cameras that look down at the middle, in the level frame."""
     angles = 2 * np.pi * np.arange(COUNT) / COUNT
     places = 30 * np.stack([np.cos(angles), np.full(COUNT, -0.3), np.sin(angles)], axis=1)
-    turns = np.stack([facing(-place, np.array([0.0, -1, 0])) for place in places])
+    turns = np.stack([look_along(-place, np.array([0.0, -1, 0])) for place in places])
     for number, roll in enumerate(rolls):
         turns[number] = turns[number] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
     return turns, places
@@ -114,7 +114,7 @@ def test_a_tilted_scene_without_exif_data_becomes_level_in_its_own_unit(tmp_path
 
 
 def test_cameras_that_face_one_way_take_their_mean_up():
-    turns = np.repeat(facing(np.array([1.0, 0.3, 0]), np.array([0.0, -1, 0]))[None], 5, axis=0)
+    turns = np.repeat(look_along(np.array([1.0, 0.3, 0]), np.array([0.0, -1, 0]))[None], 5, axis=0)
     np.testing.assert_allclose(level_up(turns), -turns[0][:, 1], atol=1e-6)
 
 

@@ -18,7 +18,7 @@ from applications.export.page_start import PICTURE, named, write_preview
 from gaussian_renderer import render
 from gaussian_renderer.camera_paths import without_scene
 from gaussian_renderer.camera_paths.poses import Poses, poses_of
-from gaussian_renderer.camera_paths.start import LEAST, MOST, best_start, narrowed
+from gaussian_renderer.camera_paths.start import LEAST, MOST, best_start, narrow_fov
 from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
 from splatting import cleaning
@@ -65,7 +65,7 @@ def test_a_start_is_named_with_or_without_its_ending():
     ],
 )
 def test_a_photo_fills_a_window_unless_that_hides_much_of_it(photo, window, heights):
-    assert math.tan(narrowed(math.radians(40), photo, window) / 2) == pytest.approx(
+    assert math.tan(narrow_fov(math.radians(40), photo, window) / 2) == pytest.approx(
         heights * math.tan(math.radians(20))
     )
 
@@ -75,7 +75,7 @@ def test_the_picture_beside_a_link_is_the_first_one(tmp_path):
     write_preview(tmp_path / "page.jpg", splats, camera, pipeline(), (0.2, 0.4, 0.3))
     shown = np.asarray(Image.open(tmp_path / "page.jpg"), np.float64)
     assert shown.shape == (*PICTURE[::-1], 3)
-    poses, fov = poses_of([camera]), narrowed(math.radians(FOV), SIZE[0] / SIZE[1], PICTURE[0] / PICTURE[1])
+    poses, fov = poses_of([camera]), narrow_fov(math.radians(FOV), SIZE[0] / SIZE[1], PICTURE[0] / PICTURE[1])
     view = free_view(*PICTURE, fov, poses.positions[0].tolist(), poses.quaternions[0].tolist(), "cpu")
     with torch.no_grad():
         image = render(view, model_of(splats), pipeline(), torch.tensor([0.2, 0.4, 0.3]))["render"]

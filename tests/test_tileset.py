@@ -20,14 +20,14 @@ from applications.export.grouping import groups_of
 from applications.export.levels import GROUP, joined, losses, octree
 from applications.export.merging import areas, footprints, merged
 from applications.export.sog import PROGRAM, run_program
-from gaussian_renderer.camera_paths.without_scene import circle
+from gaussian_renderer.camera_paths.without_scene import circle_cameras
 from scene.splats.reading import read_splats
 from scene.splats.splats import Splats, opacities, selected
 from utils.system_utils import UserError
 
 
 def _around(some: Splats) -> Around:
-    return Around(circle(some.means)[:1], (0.0, 0.0, 0.0), pipeline(), None, None)
+    return Around(circle_cameras(some.means)[:1], (0.0, 0.0, 0.0), pipeline(), None, None)
 
 
 def _written(path: Path, some: Splats) -> dict:

@@ -28,7 +28,7 @@ from applications.viewer.tabs import first_box  # noqa: E402
 from applications.viewer.untrained import _spheres  # noqa: E402
 from applications.viewer.views import Settings  # noqa: E402
 from gaussian_renderer.camera_paths.start import LEAST, MOST  # noqa: E402
-from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle_cameras  # noqa: E402
 from groundwork.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
 from scene import Scene  # noqa: E402
 from scene.with_splats import model_of  # noqa: E402
@@ -253,7 +253,7 @@ def test_reset_gives_the_view_its_first_values(page):
 
 
 def test_without_photos_nothing_is_compared_with_them(tmp_path):
-    cameras = circle(np.float32([[0, 0, 0], [1, 1, 1]]))
+    cameras = circle_cameras(np.float32([[0, 0, 0], [1, 1, 1]]))
     shown = Page(ANY, WithoutScene(model(5), str(tmp_path), "a.ply", cameras), pipeline(), False, False)
     assert shown.images.comparison.disabled and "Error" not in shown.view.mode.options
     shown.stop()
@@ -371,7 +371,7 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
     (tmp_path / "out/model.json").write_text("{}")
     gaussians = model_of(_spheres(places, np.ones((4, 3), np.float32), 0.05))
     gaussians.world_offset = (10.0, 0.0, 0.0)
-    shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle(places))
+    shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle_cameras(places))
     page = Page(ANY, shown, pipeline(), False, False, oriented=str(tmp_path / "scene"))
     tab = page.measure
     with Client(page.url) as client:

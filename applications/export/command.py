@@ -29,9 +29,9 @@ from applications.export.upright import add_upright_options, check_upright, orie
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer.camera_paths.without_scene import (
     WithoutScene,
-    circle,
-    record_of,
+    circle_cameras,
     recorded_cameras,
+    recorded_cameras_file,
     warn_if_moved,
 )
 from gaussian_renderer.importance import most_needed
@@ -73,7 +73,7 @@ def load(
             "--max_splats, --clean, --walk and meshes need training views; give their model folder with -m, and beside "
             f"it --ply {args.ply}"
         )
-    record = record_of(options) if needs_views and not needs_photos else None
+    record = recorded_cameras_file(options) if needs_views and not needs_photos else None
     if needs_views and record is None:
         options.images_to_load = 1  # each image is used once or twice
         smooth = argparse.Namespace(antialiasing=bool(args.antialiasing))
@@ -217,7 +217,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         if (key := (id(chosen), entry.of_scene)) not in in_place:
             around = None
             if entry.of_scene:
-                cameras = scene.getTrainCameras() if scene else circle(chosen.means)
+                cameras = scene.getTrainCameras() if scene else circle_cameras(chosen.means)
                 details = {name: getattr(args, name) for name in _DETAILS}
                 around = Around(cameras, background, pipe, make_path, **details, made={})
             in_place[key] = placed(args, entry.of_scene, chosen, around)

@@ -23,7 +23,7 @@ from applications.export.notes import Note, Notes
 from applications.export.page_start import named
 from applications.export.vendor import FOLDER, RECORD, VIEWER
 from gaussian_renderer.camera_paths.keyframes import TimedPath
-from gaussian_renderer.camera_paths.poses import Poses, facing, focus_point, keyframe, poses_of, ray_through, unit
+from gaussian_renderer.camera_paths.poses import Poses, focus_point, keyframe, look_along, poses_of, ray_through, unit
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.median_depth import median_at
 from groundwork.files.json_files import read_json
@@ -230,7 +230,7 @@ def _thing(
     camera, pose = cameras[row], poses_of([cameras[row]])
     ray = ray_through(camera, *note.at) if note.at else np.zeros(3)
     ray = unit(ray) if ray.any() else pose.forward[0]
-    key = keyframe(0.0, pose.positions[0], facing(ray, -pose.turns[0, :, 1]), pose.fov[0])
+    key = keyframe(0.0, pose.positions[0], look_along(ray, -pose.turns[0, :, 1]), pose.fov[0])
     size = camera.image_width | 1, camera.image_height | 1  # so that the ray is in the middle of a pixel
     view = free_view(*size, np.radians(key.fov), key.position, key.wxyz, gaussians.get_xyz.device)
     return pose.positions[0] + (median_at(view, gaussians, pipe, size[0] // 2, size[1] // 2) or usual) * ray

@@ -10,8 +10,8 @@ from PIL import Image
 
 from applications.export.notes import Note
 from gaussian_renderer import render
-from gaussian_renderer.camera_paths.poses import opening, poses_of
-from gaussian_renderer.camera_paths.start import narrowed
+from gaussian_renderer.camera_paths.poses import poses_of, vertical_fov
+from gaussian_renderer.camera_paths.start import narrow_fov
 from gaussian_renderer.free_view import free_view
 from groundwork.files.image_files import to_bytes
 from groundwork.files.ours import write_picture
@@ -53,7 +53,7 @@ def write_preview(
 ) -> None:
     """Write a JPEG of the first picture, in a window of PICTURE."""
     (width, height), poses = PICTURE, poses_of([camera])
-    fov = narrowed(opening(camera), camera.image_width / camera.image_height, width / height)
+    fov = narrow_fov(vertical_fov(camera), camera.image_width / camera.image_height, width / height)
     model = model_of(splats)
     place = poses.positions[0].tolist(), poses.quaternions[0].tolist()
     view = free_view(width, height, fov, *place, model.get_xyz.device)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_renderer.camera_paths.poses import keyframe, opening, poses_of
+from gaussian_renderer.camera_paths.poses import keyframe, poses_of, vertical_fov
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.median_depth import Surface, surface_of
 from groundwork.host.progress import Bar
@@ -58,7 +58,7 @@ def pinholes(cameras: Sequence[Camera]) -> list[Camera | MiniCam]:
         if getattr(camera, "lens", None) is not None:
             pose = keyframe(0.0, poses.positions[0], poses.turns[0], 0.0)
             size = camera.image_width, camera.image_height
-            camera = free_view(*size, opening(camera), pose.position, pose.wxyz, camera.device)
+            camera = free_view(*size, vertical_fov(camera), pose.position, pose.wxyz, camera.device)
         views.append(camera)
     return views
 

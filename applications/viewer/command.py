@@ -18,7 +18,7 @@ from applications.viewer.page import Page, serve
 from applications.viewer.server import check_port
 from applications.viewer.untrained import untrained
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle, saved_scene, warn_if_moved
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle_cameras, saved_scene, warn_if_moved
 from groundwork.applications import VIEWER_PORT, application
 from scene.gaussians.morton import sort_scattered
 from scene.scene import Scene
@@ -39,7 +39,7 @@ def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
     folder, name = os.path.split(os.path.abspath(path))
     gaussians = model_of(splats)
     sort_scattered(gaussians)
-    return WithoutScene(gaussians, folder, name, circle(splats.means))
+    return WithoutScene(gaussians, folder, name, circle_cameras(splats.means))
 
 
 def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from applications.viewer.views import window_of
-from gaussian_renderer.camera_paths.poses import opening
+from gaussian_renderer.camera_paths.poses import vertical_fov
 from scene.cameras import Camera
 from utils.graphics_utils import camera_center
 
@@ -53,7 +53,7 @@ class Divider:
         from viser.transforms import SO3
 
         self._cameras[client.client_id] = camera
-        turn, slope = np.asarray(camera.R), np.tan(opening(camera) / 2)
+        turn, slope = np.asarray(camera.R), np.tan(vertical_fov(camera) / 2)
         across = (2 * share - 1) * slope * camera.image_width / camera.image_height
         drawn.position = camera_center(camera.R, camera.T) + self._away * (turn[:, 2] + across * turn[:, 0])
         drawn.wxyz, drawn.scale, drawn.visible = SO3.from_matrix(turn).wxyz, self._away * slope, True

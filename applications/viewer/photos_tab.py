@@ -11,8 +11,8 @@ from applications.viewer.divider import Divider
 from applications.viewer.frusta import Frusta
 from applications.viewer.tabs import serialized
 from applications.viewer.views import SceneCameras, Settings
-from gaussian_renderer.camera_paths.poses import opening
-from gaussian_renderer.camera_paths.start import narrowed
+from gaussian_renderer.camera_paths.poses import vertical_fov
+from gaussian_renderer.camera_paths.start import narrow_fov
 from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ class ImagesTab:
         if camera is None:
             return
         place, axes, up = camera_center(camera.R, camera.T), np.asarray(camera.R), self._cameras.up_at(camera.R)
-        target, fov = self._cameras.target_of(place, axes), opening(camera)
+        target, fov = self._cameras.target_of(place, axes), vertical_fov(camera)
         if self._all_drawn:
             place, axes, target = self._cameras.overview()
             up, fov = self._cameras.up, views.overview_fov(1.0)
@@ -91,7 +91,7 @@ class ImagesTab:
         if self._all_drawn:
             client.camera.fov = views.overview_fov(aspect)
         elif self.comparison.value == views.ALONE:
-            client.camera.fov = narrowed(opening(camera), camera.image_width / camera.image_height, aspect)
+            client.camera.fov = narrow_fov(vertical_fov(camera), camera.image_width / camera.image_height, aspect)
         else:
             client.camera.fov = views.fov_of_canvas(camera, aspect)
 

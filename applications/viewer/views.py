@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gaussian_renderer.camera_paths.poses import facing, focus_point, opening, poses_of, unit
+from gaussian_renderer.camera_paths.poses import focus_point, look_along, poses_of, unit, vertical_fov
 from gaussian_renderer.camera_paths.start import best_start
 from gaussian_renderer.free_view import rotation_matrix
 from groundwork.host.listing import as_utf8
@@ -142,7 +142,7 @@ class SceneCameras:
             ahead = axis - (axis @ self.up) * self.up
             if np.linalg.norm(ahead) > 1e-3:
                 break
-        axes = facing(math.cos(_ABOVE) * unit(ahead) - math.sin(_ABOVE) * self.up, self.up)
+        axes = look_along(math.cos(_ABOVE) * unit(ahead) - math.sin(_ABOVE) * self.up, self.up)
         inner = np.vstack([self._places] + ([] if self._target is None else [self._target])) @ axes
         middle = (inner.min(0) + inner.max(0)) / 2
         slope = _FILLED * math.tan(_OF_ALL / 2)
@@ -171,7 +171,7 @@ def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:
 def fov_of_canvas(camera: Camera, aspect: float) -> float:
     """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's image."""
     _, height = canvas(camera.image_width, camera.image_height, aspect)
-    return 2 * math.atan(math.tan(opening(camera) / 2) * height / camera.image_height)
+    return 2 * math.atan(math.tan(vertical_fov(camera) / 2) * height / camera.image_height)
 
 
 def overview_fov(aspect: float) -> float:

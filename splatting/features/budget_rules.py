@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gaussian_renderer import exposed
+from gaussian_renderer import apply_trained_exposure
 from gaussian_renderer.blending import weighted_sums
 from groundwork.deterministic.portable_math import exp, log
 from groundwork.ranks.rows import changes_rows
@@ -100,7 +100,7 @@ def error_scores(
 
     def errors(image: Tensor, camera: Camera) -> Tensor:
         target, mask = camera.ground_truth(background)
-        image = exposed(image, camera, gaussians) if exposures else image
+        image = apply_trained_exposure(image, camera, gaussians) if exposures else image
         return error_map(image, target, mask, camera.columns).expand(3, -1, -1).contiguous()
 
     total = torch.zeros(len(gaussians), dtype=torch.float64, device=background.device)

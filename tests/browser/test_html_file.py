@@ -17,7 +17,7 @@ from test_html_export import Page as HtmlPage
 from applications.export.html import write_html
 from applications.export.walking import EYES, solid_of
 from gaussian_renderer.camera_paths.poses import poses_of
-from gaussian_renderer.camera_paths.start import narrowed
+from gaussian_renderer.camera_paths.start import narrow_fov
 from gaussian_renderer.free_view import free_view
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, heigh
     show(tab, page)
     shown = settled(tab)
     camera = cameras()[0]
-    fov, (position, turn) = narrowed(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
+    fov, (position, turn) = narrow_fov(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
     view = free_view(width, height, fov, position, turn, "cpu")
     assert psnr(shown, expected(splats, view)) > 31
     faded = tab.evaluate("[...document.querySelectorAll('.sse-sceneLayer > div')].map(e => e.style.background).join()")
