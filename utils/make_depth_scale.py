@@ -1,7 +1,7 @@
 """Fit a scene's depth maps to its COLMAP points.
 
-Maps of inverse depth get scale and offset each, in depth_params.json beside the model. Metric maps get one scale, in
-metric.json beside them.
+Each map of inverse depth gets a scale and an offset, in depth_params.json beside the model. Metric maps get one scale
+for all, in metric.json beside them.
 
 python utils/make_depth_scale.py --base_dir SCENE --depths_dir SCENE/depths
 """
