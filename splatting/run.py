@@ -98,7 +98,7 @@ class Run:
         agree_on_scene(self.scene, self.start)  # before an image is shared
         count = len(capture[1] if capture else self.scene.info.point_cloud.points if first is None else first)
         self.gaussians.divide(self.group)
-        self.gaussians.room.expect(-(-count // self.group.size), self.scene)
+        self.gaussians.storage.reserve(-(-count // self.group.size), self.scene)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self.decode_ahead(self.first_iteration + 1)
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)

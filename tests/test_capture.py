@@ -14,7 +14,7 @@ from applications.convert.capture import compared, looks_of
 from applications.convert.capture_page import write_page
 from applications.convert.findings import lines_of, neighbours_of, of_model, unusable, worth
 from applications.convert.layout import Layout
-from scene.checks.conversion import left_out
+from scene.checks.conversion import describe_left_out
 from scene.checks.photos import SHARED_TEXT
 from utils.system_utils import UserError
 
@@ -131,14 +131,14 @@ def test_too_few_photos_are_said(placed, said):
 
 
 def test_a_training_says_what_its_scene_lacks(tmp_path):
-    assert left_out(tmp_path) is None
+    assert describe_left_out(tmp_path) is None
     path = tmp_path / "convert_report.json"
     path.write_text(json.dumps(_report(14, 30)))
-    assert left_out(tmp_path).startswith("this scene has 14 of 30 photos (47%) of its capture")
+    assert describe_left_out(tmp_path).startswith("this scene has 14 of 30 photos (47%) of its capture")
     path.write_text(json.dumps(_report(30, 30)))
-    assert left_out(tmp_path) is None
+    assert describe_left_out(tmp_path) is None
     path.write_text("[]")
-    assert left_out(tmp_path) is None
+    assert describe_left_out(tmp_path) is None
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from applications.convert.colmap import Pycolmap, Settings
 from applications.convert.images import check_images, prepare_images
 from applications.convert.layout import Layout, refuse_foreign_results
 from applications.convert.stages import reconstruction_stages
-from scene.checks.conversion import check_conversion, is_unfinished, left_out
+from scene.checks.conversion import check_conversion, describe_left_out, is_unfinished
 from scene.dataset_readers import read_scene
 from scene.readers.scene_folder import is_scene
 from scene.readers.tracks import read_tracks
@@ -330,7 +330,7 @@ def test_a_verdict_outlives_an_interruption_and_train_finishes_what_was_begun(co
         patch.setattr(stages.report, "unusable", lambda _: verdict)
         patch.setattr(capture_page, "write_page", _interrupt)
         convert.main([*again, "native"])
-    assert verdict in left_out(copy) and is_scene(copy) and is_unfinished(copy)
+    assert verdict in describe_left_out(copy) and is_scene(copy) and is_unfinished(copy)
     assert [line for line in map(str, check_conversion(copy)) if f"says of this scene: {verdict}" in line]
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(stages.report, "write_report", _interrupt)

@@ -23,7 +23,7 @@ from applications.convert.layout import Layout, find_images, take_photos_beside
 from applications.convert.pairing import first_pairs, likeness, named_by_id, restore_names, rounds
 from applications.convert.reduced import enlarged, longest_side, reduce_photos
 from applications.convert.stages import Stage, StageRecord
-from scene.checks.conversion import changed_photos, is_unfinished, state_of
+from scene.checks.conversion import describe_changed_photos, file_state, is_unfinished
 from scene.readers.scene_folder import REPORT, find_capture
 from utils.system_utils import UserError
 
@@ -100,7 +100,7 @@ def test_photos_outside_the_largest_group_are_tried_with_all_of_it(database):
     group = {
         number
         for number in range(1, 81)
-        if number % PLACES == pairing.joined(pairing.bound_pairs(database)).pop() % PLACES
+        if number % PLACES == pairing.largest_component(pairing.bound_pairs(database)).pop() % PLACES
     }
     assert {pairing.ordered(one, other) for one in range(1, 81) for other in group if one != other} <= done
 
@@ -260,18 +260,18 @@ def test_photos_that_change_after_a_conversion_are_named(tmp_path):
     _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", "capture.html", size=1)
     (tmp_path / REPORT).write_text('{"unused": {"live.CR2": "same name"}}')
     record = StageRecord(tmp_path / "distorted" / "stages.json")
-    record.note("files", {name: state_of(tmp_path / name) for name in ("a.jpg", "b.jpg", "c.jpg")})
+    record.note("files", {name: file_state(tmp_path / name) for name in ("a.jpg", "b.jpg", "c.jpg")})
     record.run([Stage("capture", 1, lambda: None, lambda: None)])
     _fill(tmp_path, "live.CR2")
-    assert changed_photos(tmp_path) is None
+    assert describe_changed_photos(tmp_path) is None
     shutil.copytree(tmp_path, tmp_path / "copy", copy_function=shutil.copyfile)
-    assert changed_photos(tmp_path / "copy") is None
+    assert describe_changed_photos(tmp_path / "copy") is None
     (tmp_path / "a.jpg").rename(tmp_path / "d.jpg")
     _fill(tmp_path, "b.jpg", size=2)
     said = r": 1 new \(d.jpg\), 1 gone \(a.jpg\), 1 changed \(b.jpg\); .*run convert.py again, with the"
-    assert re.search(said, changed_photos(tmp_path))
+    assert re.search(said, describe_changed_photos(tmp_path))
     _fill(tmp_path, "input/e.jpg")
-    assert ": 1 new (e.jpg), 1 gone" in changed_photos(tmp_path)
+    assert ": 1 new (e.jpg), 1 gone" in describe_changed_photos(tmp_path)
 
 
 @pytest.mark.parametrize(("name", "mode"), [

@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="kind of the COLMAP model's files (default: bin)")  # fmt: skip
     args = parser.parse_args(argv)
     scene, depths = Path(args.base_dir), Path(args.depths_dir)
-    if metric := Metric.of(depths):
+    if metric := Metric.from_folder(depths):
         scale, spread, maps, photos = make_metric_scale(scene, depths, metric, args.model_type)
         print(
             f"{maps} of {photos} photos have a metric map: {scale:.4g} units of the scene for each metre, and half of "

@@ -39,7 +39,7 @@ def group(folder: Path, names: Sequence[str], mode: str) -> list[Group]:
 
     def key(name: str, lens: Lens) -> object:
         parent = PurePosixPath(name).parent
-        apart = {"per_lens": (lens, None if lens.tells_apart else parent), "per_folder": parent, "per_photo": name}
+        apart = {"per_lens": (lens, None if lens.is_distinct else parent), "per_folder": parent, "per_photo": name}
         return apart.get(mode)
 
     groups: dict[object, Group] = {}

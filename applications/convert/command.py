@@ -35,7 +35,7 @@ from applications.convert.layout import (
     scene_folder,
     take_photos_beside,
 )
-from applications.convert.orienting import said_of
+from applications.convert.orienting import describe_orientation
 from applications.convert.programs import refuse_while_working
 from applications.convert.report import lens_words, report_inputs, summary
 from applications.convert.video import FRAMES_MISSING, NOTE, report_entries, taken_frames, video_lines
@@ -43,8 +43,8 @@ from arguments import OptionParser
 from groundwork.host import torchrun
 from groundwork.host.listing import some
 from groundwork.host.start import typed_command
-from scene.checks.conversion import stages_of, state_of
-from scene.readers.scene_folder import WORK, find_capture, is_apart, is_scene
+from scene.checks.conversion import file_state, read_stages
+from scene.readers.scene_folder import WORK, find_capture, is_scene, is_unrelated
 from utils.system_utils import UserError
 
 _NAMING = ("poses", "mask_path")  # options that name a file
@@ -74,7 +74,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     names = found.photos
     if not (args.camera or args.poses or args.add or args.skip_matching):
         settings = _for_panoramas(settings, layout, names)
-    record.note("files", {name: state_of(layout.input / name) for name in names})
+    record.note("files", {name: file_state(layout.input / name) for name in names})
     if args.skip_matching:
         planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
@@ -118,7 +118,7 @@ def _conclude(layout: Layout, found: Inputs, adding: bool) -> None:
     """Print what came out, and how to train it; exit with status 3 if it is not to be trained."""
     notes = [NOTE] if taken_frames(layout) else []
     report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
-    print("\n".join((summary(report), lens_words(report), *lines_of(report), *said_of(layout))))
+    print("\n".join((summary(report), lens_words(report), *lines_of(report), *describe_orientation(layout))))
     print(f"all of it: {layout.page}")
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
@@ -145,11 +145,11 @@ def convert_first(source: str) -> None:
         return
     found = find_capture(folder.absolute())
     words, begun = ["--video", *map(str, found.videos)] if found.is_video else [], None
-    if stages_of(folder):
+    if read_stages(folder):
         there = f"; to train what is there, remove {folder / WORK}" if is_scene(folder) else ""
         print(f"a conversion of {folder} was not finished: finishing it first{there}")
         begun = _begun_options(folder)
-    elif is_apart(folder) and (found.photos or found.videos or os.path.lexists(folder / "input")):
+    elif is_unrelated(folder) and (found.photos or found.videos or os.path.lexists(folder / "input")):
         print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
         if found.is_video and found.photos:
             print(f"taking frames of {some([path.name for path in found.videos])}, which is more than the photos")
@@ -161,7 +161,7 @@ def convert_first(source: str) -> None:
 def _begun_options(folder: Path) -> dict[str, Any] | None:
     """Return the options of the conversion that was begun in a folder; None if files that they name are gone."""
     try:
-        options = dict(stages_of(folder)["options"]["made_from"])
+        options = dict(read_stages(folder)["options"]["made_from"])
         named = [*options.get("video", []), *filter(None, map(options.get, _NAMING))]
         complete = all(map(os.path.exists, named))
     except (KeyError, TypeError, ValueError):

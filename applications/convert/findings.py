@@ -204,7 +204,7 @@ def of_shared_cameras(
                 "convert again with " + ("--cameras per_lens" if several else _BY_HAND),
             )
     photos = [name for name in known if name not in frames]
-    silent = [name for name in photos if not known[name].tells_apart]
+    silent = [name for name in photos if not known[name].is_distinct]
     if mode == "per_lens" and 0 < len(silent) < len(photos):
         text = f"the EXIF data of {len(silent)} of {len(photos)} photos name no lens ({some(silent)}), and those of"
         remedy = f"if they came through several lenses, use {_BY_HAND}"

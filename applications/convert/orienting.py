@@ -42,7 +42,7 @@ def orient(layout: Layout) -> None:
     write_json(layout.orientation, record)
 
 
-def said_of(layout: Layout) -> list[str]:
+def describe_orientation(layout: Layout) -> list[str]:
     """A line on what `orient` found; none if it was not asked for."""
     if (record := read_orientation(layout.scene)) is None:
         return []

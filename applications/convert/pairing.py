@@ -14,7 +14,7 @@ import numpy as np
 import pycolmap
 
 from applications.convert.database import opened
-from scene.agreement import joined
+from scene.agreement import largest_component
 
 _NEXT, _NEAREST, _NEAREST_BY_GPS = 5, 20, 10  # other photos of a photo
 _MORE = 40  # of the group, which a photo outside of it is matched with first; then twice as many, and so on
@@ -45,7 +45,7 @@ def rounds(path: str, all_of: int) -> Iterator[Pairs]:
     yield tried
     left, more = _MOST * len(numbers), _MORE
     while True:
-        group = joined(bound_pairs(path))
+        group = largest_component(bound_pairs(path))
         inside = np.array([number in group for number in numbers])
         new: Pairs = set()
         for place in np.flatnonzero(~inside):

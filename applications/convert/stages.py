@@ -26,7 +26,7 @@ from applications.convert.mapping import map_photos
 from applications.convert.orienting import orient
 from applications.convert.programs import run_programs
 from groundwork.files.json_files import read_json, write_json
-from scene.checks.conversion import state_of
+from scene.checks.conversion import file_state
 from utils.system_utils import UserError, mkdir_p
 
 FACTORS = (2, 4, 8)  # of --resize
@@ -137,7 +137,7 @@ def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
 
     return Stage(
         "video",
-        [[state_of(path) for path in videos], count],
+        [[file_state(path) for path in videos], count],
         reset=partial(video.remove_frames, layout),
         work=partial(video.extract_videos, layout, videos, count),
         check=check,
@@ -146,9 +146,9 @@ def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
 
 def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     """Make the stage that puts upright photos and masks into the work folder."""
-    made_from = [[name, state_of(layout.input / name)] for name in names]
+    made_from = [[name, file_state(layout.input / name)] for name in names]
     if masks:
-        made_from.append([[str(path), state_of(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
+        made_from.append([[str(path), file_state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
 
     return Stage(
         "photos",
@@ -163,7 +163,7 @@ def poses_stage(layout: Layout, source: Path) -> Stage:
     """Make the stage that finds the given poses and cameras of the photos."""
     return Stage(
         "poses",
-        [[str(path), state_of(path)] for path in files_of(source)],
+        [[str(path), file_state(path)] for path in files_of(source)],
         reset=lambda: _remove(layout.given),
         work=lambda: write_given(layout, source),
         check=lambda: posed_photos(layout, source) and None,
@@ -326,7 +326,7 @@ def model_state(layout: Layout) -> list[Any]:
     files = sorted(layout.models.rglob("*.*")) if layout.models.is_dir() else []
     if not files:
         raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; omit the option to make one")
-    return [[str(path.relative_to(layout.models)), *state_of(path)] for path in files]
+    return [[str(path.relative_to(layout.models)), *file_state(path)] for path in files]
 
 
 def _registered_since(log: Path) -> Callable[[], int]:

@@ -20,7 +20,7 @@ from arguments import ModelParams, read_training_options
 from groundwork.files.json_files import write_json
 from groundwork.finding import Finding, note
 from groundwork.ranks.ranks import ranks
-from scene.checks.scene import findings, tell
+from scene.checks.scene import findings, report
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
@@ -51,7 +51,7 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
     if trains:
-        tell(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
+        report(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     if any(tracks):
         yield from _of_tracks(scene, tracks)

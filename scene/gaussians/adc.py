@@ -56,7 +56,7 @@ def densify_and_prune(
     """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
     min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
-    None, Gaussians wider than that or than a tenth of the extent are removed; none that is pinned is so for its width.
+    None, Gaussians wider than that or than a tenth of the extent are removed, except fixed ones.
     radii: (N,) pixels of this view, `tmp_radii` until the end. seed and iteration decide the positions of split
     children; without a seed, torch's generator draws one. max_splats > 0 bounds the number of Gaussians.
     """
@@ -83,14 +83,14 @@ def densify_and_prune(
         # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
         remove |= gaussians.max_radii2D > max_screen_size
         large = ~rules.is_small(gaussians.log_scales(), rules.PRUNE_EXTENT * extent)
-        remove |= large if gaussians.pinned is None else large & ~gaussians.pinned(gaussians.raw("xyz"))
+        remove |= large if gaussians.fixed is None else large & ~gaussians.fixed(gaussians.raw("xyz"))
     gaussians.prune_points(remove)
     if radii is not None:
         gaussians.tmp_radii = None
 
 
 def _grows_by_own_steps(gaussians: GaussianParameters) -> bool:
-    """Whether nobody has replaced a step of density control, so that they may be taken together."""
+    """Tell whether all steps of density control are ours, so that they may be taken together."""
     own = densify_and_clone, densify_and_split, densification_postfix, prune_points
     return all(getattr(getattr(gaussians, step.__name__), "__func__", None) is step for step in own)
 

@@ -1,4 +1,4 @@
-"""What PLYs of other programs say in columns of their own, or in other units than ours."""
+"""Columns of other programs' PLYs that we read or report, and values in other units than ours."""
 
 import math
 import os
@@ -19,10 +19,10 @@ _LARGE = 0.01  # of the model's extent: a usual size that no trained model has
 _NO_LOGIT = 50.0  # beyond it, values are percent or bytes
 
 
-def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, used: Collection[str]) -> Rows:
-    """Rows of a PLY with the 3D filter that it has beside them; lines tell of that, and of what is not used.
+def apply_foreign_filter(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, used: Collection[str]) -> Rows:
+    """Apply a PLY's own 3D filter to its rows; print a line on that, and on columns that are not used.
 
-    A warning tells of values that are no logits or logarithms. used: names of the columns that the rows are from.
+    A warning is printed for values that are no logits or logarithms. used: names of the columns of the rows.
     """
     _warn_of_units(path, rows)
     names = set(vertices.dtype.names or ()) - set(used)
@@ -44,7 +44,7 @@ def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, us
 
 
 def _filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
-    """Logits (N, 1) and log scales (N, 3) behind the filter of `widths` (N, 1) of Mip-Splatting (Yu et al. 2024).
+    """Apply the filter of `widths` (N, 1) of Mip-Splatting (Yu et al. 2024) to logits (N, 1) and log scales (N, 3).
 
     Variances grow by that of the filter, and the opacity falls with the square root of the covariance's determinant.
     """
@@ -58,9 +58,9 @@ def _filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tenso
 
 
 def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:
-    """Warn of opacities, colours and scales as they are drawn, instead of logits, SH coefficients and logarithms.
+    """Warn if opacities, colours and scales seem to be plain values, no logits, SH coefficients and logarithms.
 
-    A trained model has faint and dark Gaussians, whose values are below 0, and sizes far below its extent.
+    A trained model has faint and dark Gaussians, with values below 0, and sizes far below its extent.
     """
     if not len(rows["xyz"]):
         return

@@ -60,7 +60,7 @@ def picture_sizes(paths: Sequence[Path]) -> list[tuple[int, int]]:
 
 
 def may_be_transparent(path: Path) -> bool:
-    """Whether a readable image file has an alpha channel or a transparent colour, from its header."""
+    """Tell whether a readable image file has an alpha channel or a transparent colour, from its header."""
     with open_image(path) as image:
         return image.has_transparency_data
 

@@ -58,7 +58,7 @@ def comments(splats: Splats) -> list[str]:
 
 
 def says_antialiasing(path: str | os.PathLike) -> bool:
-    """Whether the comments of a PLY say that its splats were trained with antialiasing; the last one counts."""
+    """Tell whether the comments of a PLY say that its splats were trained with antialiasing; the last one counts."""
     found = False
     for line in header_lines(path):
         words = line.lower().replace(":", " ").split()

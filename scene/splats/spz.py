@@ -117,9 +117,9 @@ def _streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
 
 
 def _drawn_in(splats: Splats) -> Splats:
-    """The splats, of which the farthest are nearer and smaller, so that they look the same from the middle.
+    """Move the farthest splats nearer and shrink them, so that they look the same from the middle.
 
-    All positions have the same steps, which one splat far away would make coarse. It is told which splats change.
+    All positions have the same step, which one splat far away would make coarse. A message counts the changed splats.
     """
     middle, distances, usual = spread(splats.means)
     limit = _FARTHEST * usual
