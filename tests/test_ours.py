@@ -34,7 +34,7 @@ MAY = {
     "applications.convert.colmap._output": FOUND,
     "applications.convert.programs._run": FOUND,  # COLMAP, or worker.py
     "applications.convert.video._warn_if_cut": "runs imageio-ffmpeg's ffmpeg, without relative entries of PATH",
-    "applications.convert.video._filters": "the same",
+    "applications.convert.video._sdr_filters": "the same",
     "applications.convert.video.find_streams": "the same",
     "applications.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
     "groundwork.host.machine.facts_asked": SELF,

@@ -71,7 +71,7 @@ def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path]
     return Inputs(sorted(photos), unused)
 
 
-def unused_lines(unused: dict[str, str]) -> list[str]:
+def describe_unused(unused: dict[str, str]) -> list[str]:
     """One line for each reason, with names of files."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in unused.items():
@@ -80,7 +80,7 @@ def unused_lines(unused: dict[str, str]) -> list[str]:
 
 
 class _Kind(NamedTuple):
-    """What a file is. format: of a photo, else ""; reason: why it cannot be used, or ""."""
+    """Kind of a file. format: of a photo, else ""; reason: why the file cannot be used, or ""."""
 
     format: str
     reason: str
@@ -107,18 +107,18 @@ def _kind(path: Path, thorough: bool) -> _Kind:
 
 
 def _heif_kind(path: Path, thorough: bool) -> _Kind:
-    """Of HEIC and AVIF, which are files of one container."""
+    """Return the kind of a HEIC or AVIF file, which share a container format."""
     if (points := code_points(plain(path), "HEIF")) and points[1] in HDR:
         return _Kind("HEIF", _HDR)
-    if not _is_whole(path):
+    if not _is_complete(path):
         return _Kind("HEIF", _DAMAGED)
-    readable = _register_heif()
+    readable = _enable_heif()
     kind = _picture_kind(path, thorough)
     return _Kind("HEIF", _INSTALL) if kind.reason and not readable else kind
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether the boxes of an ISO file (ISO/IEC 14496-12) end where the file does."""
+def _is_complete(path: Path) -> bool:
+    """Tell if the boxes of an ISO file (ISO/IEC 14496-12) end where the file does."""
     place, size = 0, path.stat().st_size
     with open(path, "rb") as file:
         while place < size:
@@ -157,13 +157,13 @@ def _picture_kind(path: Path, thorough: bool) -> _Kind:
 
 
 def _is_tga(path: Path) -> bool:
-    """Whether a file that can pass for a TGA is one: its header has no mark, but newer files have one at their end."""
+    """Tell if a file that Pillow reads as TGA is one: the header has no mark, but newer files have one at the end."""
     with open(path, "rb") as file:
         file.seek(max(path.stat().st_size - 26, 0))
         return path.suffix.lower() == ".tga" or file.read().startswith(b"TRUEVISION-XFILE")
 
 
-def _register_heif() -> bool:
+def _enable_heif() -> bool:
     """Let Pillow read HEIC; return whether it can."""
     if "HEIF" not in Image.OPEN:
         try:
