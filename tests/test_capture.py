@@ -14,6 +14,7 @@ from applications.convert.capture_page import write_page
 from applications.convert.checks import (
     check_reconstruction,
     describe_capture,
+    find_gaps,
     find_neighbours,
     rate_capture,
     why_unusable,
@@ -63,12 +64,30 @@ def test_what_is_weak_blurred_and_darker_is_named(folder):
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
     assert [line.split(":")[0] for line in found["again"]] == [
-        "what e.jpg show, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
+        "Take photos on the way from e.jpg to the others, each overlapping the one before by 60 to 80 %",
+        "Take more photos around d.jpg", "Hold the camera still, or add light, for b.jpg",
+        "Use a fixed exposure, if you can",
     ]  # fmt: skip
     assert found["again"][-1].endswith("--appearance ppisp")
     assert describe_capture(_report(4, 5, "e.jpg") | found)[:2] == [
         "overlap: 1 of 4 photos weakly connected (d.jpg)", "blur: 1 of 5 photos blurred (b.jpg)",
     ]  # fmt: skip
+
+
+def test_where_photos_are_missing_is_said():
+    """The placed photos around a hole name it; single photos, and those at an end of a folder, are none."""
+    placed = ["0.jpg", "3.jpg", "5.jpg", "9.jpg", "a/1.jpg", "a/5.jpg"]
+    left = ["1.jpg", "2.jpg", "4.jpg", "6.jpg", "7.jpg", "8.jpg", "a/0.jpg", "a/6.jpg", "b/1.jpg", "b/2.jpg"]
+    assert find_gaps(left, placed) == [(3, "5.jpg", "9.jpg"), (2, "0.jpg", "3.jpg")]
+    photos = {name: {"shared": {other: 99 for other in placed if other != name}} for name in placed}
+    report = _report(6, 16, *left) | {"tried": [{"against": ["1.jpg", "4.jpg"]}]}
+    said = rate_capture(report, photos, {})["again"]
+    assert said[:2] == [
+        "Take photos between 5.jpg and 9.jpg: 3 there could not be placed",
+        "Take photos between 0.jpg and 3.jpg: 2 there could not be placed",
+    ]
+    assert len(said) == 3 and said[2].startswith("Take photos on the way from a/0.jpg, a/6.jpg, b/1.jpg, b/2.jpg to")
+    assert not find_gaps(["1.jpg"], ["0.jpg", "2.jpg"]) and not find_gaps([], placed) and not find_gaps(left, [])
 
 
 def test_what_photos_show_does_not_count(tmp_path):
@@ -127,7 +146,7 @@ def test_the_page_shows_what_is_wrong_with_each_photo(folder):
     assert re.findall('<a href="#photo(.)"( class="weak")?.*?<title>(.*?)</title>', text) == [
         ("5", "", "c.jpg"), ("4", "", "a.jpg"), ("1", ' class="weak"', "d.jpg"), ("0", "", "b.jpg"),
     ]  # fmt: skip
-    assert '<li class="problem">4 of 6 photos placed' in text and "<li>around d.jpg: fewer than 2 other" in text
+    assert '<li class="problem">4 of 6 photos placed' in text and "<li>Take more photos around d.jpg" in text
 
 
 @pytest.mark.parametrize(("placed", "said"), [(5, True), (6, False), (10, False)])

@@ -85,9 +85,9 @@ def write_page(
 
 
 def _lines(report: _Data) -> list[tuple[str, bool]]:
-    """The lines of the report but what to photograph again, each with whether it tells of a problem."""
+    """List the lines of the report but those on photos to take, each with True if it tells of a problem."""
     found = {"overlap": report["weakly_connected"], "blur": report["blurred"], "brightness": training_options(report)}
-    said = describe_capture(report)[: -len(report["again"]) or None]  # what to photograph again comes last
+    said = describe_capture(report)[: -len(report["again"]) or None]  # photos to take again come last
     return [
         (summarise(report), bool(report["left_out"])),
         *((line, bool(found.get(line.split(":")[0]))) for line in said),

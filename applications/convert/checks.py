@@ -5,6 +5,8 @@ convert.py's report has their results, which train.py and doctor.py read.
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import groupby
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -36,6 +38,7 @@ SHARED = 30  # points that a photo shares with another one that is near
 FEW = 2  # such neighbours, with which a photo is weakly connected
 _MANY = 0.05  # share of a camera's photos: a few may be wrong for other reasons
 _FEWEST = 3
+_MOST_GAPS = 3
 _EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
 _BY_HAND = "--cameras per_photo, or put the photos of each lens into a sub-folder and use --cameras per_folder"
 _OVERLAPPING = "each overlapping the one before by 60 to 80 %"
@@ -248,7 +251,7 @@ def rate_capture(
     photos: of capture.json.
     looks: of all photos, from `compare_brightness`.
     Returns `weakly_connected` and `blurred`, names of photos; `brightness_spread_stops` of the placed photos, or None;
-    and `again`, a line for each thing to photograph again.
+    and `again`, a sentence for each thing to photograph again.
     """
     neighbours = find_neighbours(photos)
     against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}
@@ -257,9 +260,15 @@ def rate_capture(
     bright = [look.brightness for name, look in looks.items() if name in photos and math.isfinite(look.brightness)]
     spread = round(float(np.std(bright)), 3) if bright else None
     if any(SHARED_TEXT in line for line in report.get("advice", ())):  # why photos are left out or weakly connected
-        again = _list_retakes([], [], soft, spread)
+        again = _list_retakes([], [], [], soft, spread)
     else:
-        again = _list_retakes(sorted(set(report["left_out"]) - against), weak, soft, spread)
+        gaps = find_gaps(report["left_out"], photos)
+        others = [
+            name
+            for name in sorted(set(report["left_out"]) - against)
+            if not any(before < name < after for _, before, after in gaps)
+        ]
+        again = _list_retakes(gaps, others, weak, soft, spread)
     return {
         "weakly_connected": weak,
         "blurred": soft,
@@ -268,23 +277,45 @@ def rate_capture(
     }
 
 
-def _list_retakes(left_out: list[str], weak: list[str], soft: list[str], spread: float | None) -> list[str]:
-    lines = []
+def _list_retakes(
+    gaps: list[tuple[int, str, str]], left_out: list[str], weak: list[str], soft: list[str], spread: float | None
+) -> list[str]:
+    lines = [
+        f"Take photos between {before} and {after}: {count} there could not be placed" for count, before, after in gaps
+    ]
     if left_out:
         lines.append(
-            f"what {some(left_out)} show, if it belongs to the scene: take photos on the way from there to the others, "
-            f"{_OVERLAPPING}"
+            f"Take photos on the way from {some(left_out)} to the others, {_OVERLAPPING}: "
+            f"{'this one' if len(left_out) == 1 else 'these'} could not be placed"
         )
     if weak:
-        lines.append(f"around {some(weak)}: fewer than {FEW} other photos share points with each; take more there")
+        lines.append(f"Take more photos around {some(weak)}: fewer than {FEW} other photos share points with each")
     if soft:
-        lines.append(f"{some(soft)}: blurred; hold the camera still, or add light")
+        lines.append(f"Hold the camera still, or add light, for {some(soft)}: blurred")
     if spread and spread > EXPOSURES:
         lines.append(
-            f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
+            f"Use a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
             f"with {_EXPOSURES}"
         )
     return lines
+
+
+def find_gaps(left_out: Collection[str], placed: Collection[str]) -> list[tuple[int, str, str]]:
+    """Find runs of several left-out photos between two placed ones, by name and within a folder.
+
+    Returns the _MOST_GAPS longest runs, longest first: number of photos, and the placed photos before and after.
+    """
+    found = []
+    for _, names in groupby(sorted({*left_out, *placed}), lambda name: PurePosixPath(name).parent):
+        before, count = "", 0
+        for name in names:
+            if name in left_out:
+                count += 1
+                continue
+            if before and count > 1:
+                found.append((count, before, name))
+            before, count = name, 0
+    return sorted(found, key=lambda gap: -gap[0])[:_MOST_GAPS]
 
 
 def describe_capture(report: Mapping[str, Any]) -> list[str]:
@@ -298,8 +329,7 @@ def describe_capture(report: Mapping[str, Any]) -> list[str]:
     lines.append(f"blur: {said if soft else 'no photo is blurred'}")
     if (spread := report["brightness_spread_stops"]) is not None:
         lines.append(f"brightness: the photos differ by {spread:.2f} stops")
-    lines += [f"photograph again {line}" for line in report["again"]]
-    return lines
+    return [*lines, *report["again"]]
 
 
 def training_options(report: Mapping[str, Any]) -> str:
@@ -319,6 +349,6 @@ def why_unusable(report: Mapping[str, Any]) -> str | None:
     if placed >= LEAST * count:
         return None
     return (
-        f"only {placed} of {count} photos are placed, so the scene is incomplete; capture.html in it says what to "
-        "photograph again"
+        f"only {placed} of {count} photos are placed, so the scene is incomplete; capture.html in it says which photos "
+        "to take"
     )

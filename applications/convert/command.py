@@ -123,7 +123,7 @@ def _print_outcome(layout: Layout, found: Inputs, adding: bool) -> None:
             (summarise(report), describe_lenses(report), *describe_capture(report), *describe_orientation(layout))
         )
     )
-    print(f"all of it: {layout.page}")
+    print(f"Report: {layout.page}")
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
     if adding:
