@@ -76,7 +76,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
         return environment._check_extension("simple-knn").line
 
     monkeypatch.setattr(environment, "ROOT", tmp_path)
-    monkeypatch.setattr(environment, "_version", versions.get)
+    monkeypatch.setattr(environment, "_read_version", versions.get)
     assert check() == "ok      extension simple-knn 0.1.0+cu13"
     (package / "ops.py").write_text("changed")
     assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()

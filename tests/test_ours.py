@@ -27,7 +27,7 @@ WORK = "a reserved name in `distorted`, or in a scene that convert.py has made; 
 MAY = {
     "groundwork.host.programs.find_program": "the one place that looks for programs",
     "groundwork.host.machine._output": FOUND,
-    "applications.doctor.environment._nvidia_gpu": FOUND,
+    "applications.doctor.environment._find_nvidia_gpu": FOUND,
     "applications.export.sog.fault_of": FOUND,
     "applications.export.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
     "gaussian_renderer.camera_paths.video.write_video": FOUND,
@@ -38,7 +38,7 @@ MAY = {
     "applications.convert.video.find_streams": "the same",
     "applications.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
     "groundwork.host.machine.facts_asked": SELF,
-    "applications.doctor.advice._trained": SELF,
+    "applications.doctor.advice._train": SELF,
     "applications.evaluation.child.run_child": SELF,
     "splatting.records.curve_recorder.begin": SELF,
     # Also that of BuildModules, which empties setuptools' build folder of modules.
