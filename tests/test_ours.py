@@ -28,8 +28,8 @@ MAY = {
     "groundwork.host.programs.find_program": "the one place that looks for programs",
     "groundwork.host.machine._output": FOUND,
     "applications.doctor.environment._find_nvidia_gpu": FOUND,
-    "applications.export.sog.fault_of": FOUND,
-    "applications.export.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
+    "applications.export.sog.find_fault": FOUND,
+    "applications.export.vendor._run_command": FOUND,  # npm, and what it installs by a record of the repository
     "gaussian_renderer.camera_paths.video.write_video": FOUND,
     "applications.convert.colmap._output": FOUND,
     "applications.convert.programs._run": FOUND,  # COLMAP, or worker.py
@@ -46,9 +46,9 @@ MAY = {
     "submodules.common.build_extension.find_compiler": "the same",
     "submodules.common.build_extension.find_nvcc": "the same",
     "submodules.common.build_extension.toolkit_root": "the same",
-    "applications.export.beside._remove": "a folder that is_ours, and that no other JSON file names",
+    "applications.export.side_files._remove_folder": "a folder that is_ours, and that no other JSON file names",
     "applications.convert.video.remove_frames": "a picture that is_ours, below `input`",
-    "applications.export.beside.with_folder": OWN,
+    "applications.export.side_files.write_with_folder": OWN,
     "applications.export.streamed.write_lod_meta": OWN,
     "applications.demo.make_scene.make_scene": OWN,  # and an empty folder
     "applications.nerfbaselines.method._begin": OWN,

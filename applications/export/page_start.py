@@ -25,8 +25,8 @@ PICTURE = 1200, 630  # px, as services ask for
 _QUALITY = 88  # of its JPEG
 
 
-def named(name: str, names: Sequence[str], said: str) -> int:
-    """The camera of a photo, whose name may lack its ending. UserError if there is none, with `said`."""
+def find_named(name: str, names: Sequence[str], said: str) -> int:
+    """Return the index of the photo `name`, with or without ending. UserError, which begins with `said`, if none."""
     for found in (list(names), [os.path.splitext(one)[0] for one in names]):
         if name in found:
             return found.index(name)
@@ -36,7 +36,7 @@ def named(name: str, names: Sequence[str], said: str) -> int:
 def check_note(note: Note, cameras: Sequence[Camera]) -> None:
     """UserError for a note that names no training photo, or a place outside of it."""
     names = [str(camera.image_name) for camera in cameras]
-    width, height = cameras[named(note.camera, names, f"--notes: {note.camera}")].photo_size
+    width, height = cameras[find_named(note.camera, names, f"--notes: {note.camera}")].photo_size
     x, y = note.at or (0, 0)
     if x > width or y > height:
         fault = f"is at {x:g} {y:g}, outside of {note.camera} with {width} x {height} pixels"

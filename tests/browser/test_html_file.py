@@ -15,7 +15,7 @@ from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
 from test_html_export import Page as HtmlPage
 
 from applications.export.html import write_html
-from applications.export.walking import EYES, solid_of
+from applications.export.walking import EYES, make_solid
 from gaussian_renderer.camera_paths.poses import poses_of
 from gaussian_renderer.camera_paths.start import narrowed
 from gaussian_renderer.free_view import free_view
@@ -134,7 +134,7 @@ def test_nobody_leaves_what_photos_show(tab, page):
 
 def test_guests_walk_on_the_floor_and_stop_at_walls(tab, tmp_path):
     path = tmp_path / "room.html"
-    write_html(path, room(), in_room(), upright=True, metric=True, solid=solid_of(room(), in_room(), pipeline()))
+    write_html(path, room(), in_room(), upright=True, metric=True, solid=make_solid(room(), in_room(), pipeline()))
     show(tab, path)
     for _ in range(50):
         if tab.evaluate("viewer.state.walkAllowed"):

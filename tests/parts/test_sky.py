@@ -149,7 +149,7 @@ def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="--no_sky needs a model folder"):
-        export.sky_of(str(tmp_path), np.zeros((1, 3)))
+        export.find_sky(str(tmp_path), np.zeros((1, 3)))
     file = tmp_path / "schedule.json"
     write_schedule(file, Decided(100, [Block(9, 0.0, 1 / 9, 0.0)], 9, 9.0, strategy="mcmc"))
     words = ["-s", str(scene), "-m", str(tmp_path), "--iterations", "100", "--schedule", str(file)]
