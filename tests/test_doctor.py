@@ -21,7 +21,7 @@ import doctor
 from applications.doctor import environment
 from applications.doctor.model import check_model
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
-from benchmarks.scenes.poses import disturbed
+from benchmarks.scenes.poses import disturb_poses
 from gaussian_renderer import render
 from groundwork.finding import Finding, fine
 from scene.checks.cameras import check_extent, of_cameras
@@ -188,7 +188,7 @@ def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
 def test_poses_that_tracks_correct(colmap_scene, tmp_path):
     """Turned and moved, with points and photos as they are. No better pose is near one that is far from the model's."""
     for number, (degrees, percent, said) in enumerate([(0, 0, ""), (0.3, 0.5, "better poses"), (9, 20, "3 degrees")]):
-        folder = disturbed(colmap_scene, tmp_path / str(number), degrees, percent, 1)
+        folder = disturb_poses(colmap_scene, tmp_path / str(number), degrees, percent, 1)
         lines = [line for line in problems(check_dataset(str(folder), "images")) if "from where photos show" in line]
         assert len(lines) == bool(said) and said in "".join(lines)
         if "better" in said:

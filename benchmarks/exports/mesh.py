@@ -23,7 +23,7 @@ from applications.export.mesh_cleaning import area_vectors, keep_whole_parts, sm
 from applications.export.surfaces import Surfaces
 from applications.export.texture import barycentric, find_owners, make_texture
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import describe_machine, print_table
 from scene.cameras import Camera
 from scene.saved_model import load_saved
 from scene.with_splats import splats_of
@@ -157,7 +157,7 @@ def main() -> None:
             photos, renders, covered = texture_psnr(mesh, cameras, surfaces)
             row += [f"{photos:.2f}, {renders:.2f}", f"{100 * covered:.1f}", f"{seconds:.1f}"]
         rows.append([*row, "", "", ""][:10])
-    print(describe(compute_device()))
+    print(describe_machine(compute_device()))
     names = ["accuracy", "95 %", "completeness", "95 %", f"within {CLOSE}", "PSNR: photos, renders", "covered %"]
     print_table(["mesh", "triangles", *names, "seconds of texture"], rows)
 
