@@ -24,8 +24,8 @@ from applications.viewer import server as servers  # noqa: E402
 from applications.viewer import watchers  # noqa: E402
 from applications.viewer.measure_tab import Place  # noqa: E402
 from applications.viewer.page import Page, answer  # noqa: E402
-from applications.viewer.tabs import first_box  # noqa: E402
-from applications.viewer.untrained import _spheres  # noqa: E402
+from applications.viewer.tabs import find_first_box  # noqa: E402
+from applications.viewer.untrained import _make_spheres  # noqa: E402
 from applications.viewer.views import Settings  # noqa: E402
 from gaussian_renderer.camera_paths.start import LEAST, MOST  # noqa: E402
 from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
@@ -249,7 +249,7 @@ def test_reset_gives_the_view_its_first_values(page):
         client.look()
         _set(client, _button(page, "Reset"), True)
         wait_for(lambda: view.read() == first and not view.crop_file.field.visible and view.reset.disabled)
-    assert view.corners() == first_box(page._gaussians.get_xyz)
+    assert view.corners() == find_first_box(page._gaussians.get_xyz)
 
 
 def test_without_photos_nothing_is_compared_with_them(tmp_path):
@@ -369,7 +369,7 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
     (tmp_path / "scene").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out/model.json").write_text("{}")
-    gaussians = model_of(_spheres(places, np.ones((4, 3), np.float32), 0.05))
+    gaussians = model_of(_make_spheres(places, np.ones((4, 3), np.float32), 0.05))
     gaussians.world_offset = (10.0, 0.0, 0.0)
     shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle(places))
     page = Page(ANY, shown, pipeline(), False, False, oriented=str(tmp_path / "scene"))

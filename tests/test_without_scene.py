@@ -54,12 +54,12 @@ def test_recorded_poses_are_those_of_the_record(tmp_path):
 
 def test_a_viewer_begins_at_the_circle(tmp_path):
     path, options = written(tmp_path, ".splat", balls()), pipeline()
-    scene = view.of_file(str(path), options)
+    scene = view.load_file(str(path), options)
     assert scene.loaded_iter == path.name and len(scene.gaussians) == len(balls())
     shown = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
     assert len(shown.by_name) == COUNT and np.allclose(shown.up, [0, -1, 0], atol=1e-6)
     antialiased = written(tmp_path, ".ply", balls().__class__(**(vars(balls()) | {"antialiasing": True})))
-    view.of_file(str(antialiased), options)
+    view.load_file(str(antialiased), options)
     assert options.antialiasing
 
 
@@ -99,12 +99,12 @@ def gone(tmp_path) -> Path:
 
 def test_a_folder_whose_scene_is_gone_keeps_its_poses(gone, capsys):
     options = argparse.Namespace(model_path=str(gone), source_path=str(gone / "gone"), resolution=4)
-    scene = view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
+    scene = view.load_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
     assert scene.loaded_iter == 7 and len(scene.gaussians) == len(balls())
     assert {(camera.image_width, camera.image_height) for camera in scene.getTrainCameras()} == {(240, 180)}
     assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
     with pytest.raises(UserError, match="gone, which is gone; leave it out"):
-        view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
+        view.find_kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
 def test_every_format_of_a_folder_whose_scene_is_gone(gone, monkeypatch, capsys):
