@@ -1,4 +1,4 @@
-"""Rendering of a model for a camera: the image, and the values that adaptive density control needs."""
+"""Rendering of a model for a camera: the image, and the values for adaptive density control."""
 
 import argparse
 import math
@@ -17,8 +17,8 @@ from diff_gaussian_rasterization.scene import draw as rasterize_scene
 from torch import Tensor
 
 from gaussian_renderer.over_ranks.sharded import (
+    CachedBands,
     DividedDrawn,
-    KnownBands,
     draw_divided,
     gradient_of_colors,
     rasterizer_of,
@@ -53,21 +53,21 @@ def render(
     """Render one view.
 
     viewpoint_camera: a Camera, or an object with the attributes of MiniCam. pc: a GaussianModel, or an object with its
-    get_xyz, get_opacity, get_scaling, get_rotation, get_features and active_sh_degree. bg_color: (3,) in [0, 1] on the
-    model's device. scaling_modifier multiplies all scales. separate_sh: take get_features_dc and get_features_rest even
-    if a subclass has overridden them; the 2023 release has override_color in its place. override_color: (N, 3) instead
-    of SH. pipe: convert_SHs_python, compute_cov3D_python, debug and, where they are there, antialiasing and projection.
-    use_trained_exp: apply the trained exposure of the view's photo, if it has one. features: (N, F) further channels.
+    get_xyz, get_opacity, get_scaling, get_rotation, get_features and active_sh_degree.
+    pipe: convert_SHs_python, compute_cov3D_python, debug and, if present, antialiasing and projection.
+    bg_color: (3,) in [0, 1] on the model's device. scaling_modifier: factor of all scales.
+    separate_sh: take get_features_dc and get_features_rest even if a subclass has overridden them; the 2023 release has
+    override_color in its place. override_color: (N, 3) instead of SH. features: (N, F) further channels.
+    use_trained_exp: apply the trained exposure of the view's photo, if it has one.
 
-    Returns
-    `render` (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
-    `viewspace_points` (N, 3), whose gradient is that of the screen means, per NDC unit; its third column is 0, or with
-    want_absolute_gradient the length that `rasterize` tells of; `visibility_filter` (n, 1) int64 indices of the
-    Gaussians with radius > 0, or None without want_visibility, which saves waiting for a GPU; `radii` (N,) int32
-    pixels; `depth` inverse depth (1, H, W) by the world's unit, or None unless want_depth; with features `features`
-    (F, H, W), over a background of 0, and no depth.
+    Returns `render`: (3, H, W), clamped to [0, 1] so that values outside get no gradient; unclamped if clamp is False;
+    `viewspace_points`: (N, 3), gets the gradient of the screen means, per NDC unit; the gradient's third column is 0,
+    or with want_absolute_gradient the length of absolute gradients (see `rasterize`);
+    `visibility_filter`: (n, 1) int64 indices of the Gaussians with radius > 0; None without want_visibility, so that no
+    GPU is waited for; `radii`: (N,) int32 pixels; `depth`: inverse depth (1, H, W), 1 / world units, or None unless
+    want_depth; `features`: with features, (F, H, W) over a background of 0; there is then no depth.
     Without want_inactive_bands, get_features_rest gets no gradient at the active degree 0, instead of zeros.
-    Raises TypeError for a flag that is neither True nor False, such as the text "no".
+    TypeError for a flag that is neither True nor False, such as the text "no".
     """
     if torch.is_tensor(separate_sh):
         separate_sh, override_color = False, separate_sh
@@ -85,18 +85,18 @@ def render(
         raw=raw,
         **gaussians._asdict(),
     )
-    color = exposed(result.color, viewpoint_camera, pc) if use_trained_exp else result.color
+    color = apply_trained_exposure(result.color, viewpoint_camera, pc) if use_trained_exp else result.color
     return {
         "render": color.clamp(0, 1) if clamp else color,
         "viewspace_points": viewspace_points,
         "visibility_filter": (result.radii > 0).nonzero() if want_visibility else None,
         "radii": result.radii,
-        "depth": in_world_units(result.inverse_depth, pc),
+        "depth": to_world_units(result.inverse_depth, pc),
     } | ({} if features is None else {"features": result.features})
 
 
 class _Featured(NamedTuple):
-    """What `render` takes of an image with features."""
+    """An image with features, with the fields that `render` reads."""
 
     color: Tensor
     radii: Tensor
@@ -133,11 +133,13 @@ def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
 
 
 class Drawn:
-    """A view's image (3, H, W), its inverse depth (1, H, W) if requested, and the way back from their gradients.
+    """A rendered view: image (3, H, W), inverse depth (1, H, W) if requested, and a backward from their gradients.
 
-    The inverse depth is the rasterizer's (`in_world_units`). Both may be given `requires_grad`. blend_depth: (H, W)
-    int32, how far down its tile's list a pixel goes. What ranks draw together has the same attributes and methods.
-    band: None where the whole image is right.
+    The inverse depth is in the rasterizer's unit (`to_world_units`). Both may be given `requires_grad`. DividedDrawn
+    has the same attributes and methods.
+
+    blend_depth: (H, W) int32, number of entries of its tile's list that a pixel reads.
+    band: None, as all rows of the image are valid.
     """
 
     band = None
@@ -175,12 +177,14 @@ class Drawn:
         now: Tensor | None = None,
         camera: Tensor | None = None,
     ) -> None:
-        """Take the optimiser's step of every Gaussian, without a gradient of a parameter in memory.
+        """Take the optimiser's step of every Gaussian, without storing parameter gradients.
 
         Values, averages and statistics get the same bits as by `render`, backward, `observe` and the optimiser's step.
-        observe: add the view to the statistics of density control. absolute: with the lengths of absolute gradients
-        (`rasterize` of diff_gaussian_rasterization). now: (NOW_WORDS,) int64 on the Gaussians' device of
-        `FusedAdam.write_now`, for a step that is captured. camera: gets what `camera_gradient` gives (`FusedAdam`).
+
+        observe: add the view to the statistics of density control.
+        absolute: use the lengths of absolute gradients (`rasterize` of diff_gaussian_rasterization).
+        now: (NOW_WORDS,) int64 on the Gaussians' device, from `FusedAdam.write_now`, for a step that is captured.
+        camera: receives the gradients of `camera_gradient` (`FusedAdam`).
         """
         source, planes = self._drawing.kept(self._background), (image_gradient, None, depth_gradient)
         adam.apply(self._scene, source, planes, self.radii, observe, absolute and observe, now, camera, self._awake)
@@ -195,15 +199,16 @@ def draw(
     want_depth: bool = False,
     scaling: float = 1.0,
     by_bands: bool = False,
-    bands: KnownBands | None = None,
+    bands: CachedBands | None = None,
     sleeping: Sleeping | None = None,
     now: Tensor | None = None,
 ) -> Drawn | DividedDrawn:
-    """Render a view without autograd, to go back from the image by the methods of what it returns.
+    """Render a view without autograd; the result's methods compute gradients.
 
-    Of a model that is divided among processes: by_bands: each needs no more of the image than the loss of its band.
-    bands: those of earlier steps, in which the camera's uid stands for the view. sleeping: of the model, whose blocks
-    wake for a step. now: as for `Drawn.step`.
+    by_bands: with a model divided among ranks, each rank needs only the pixels for the loss of its band.
+    bands: with a divided model, the bands of earlier steps; the camera's uid stands for the view.
+    sleeping: the model's sleeping blocks; those that the view may show wake.
+    now: as for `Drawn.step`.
     """
     gaussians, raw = model_inputs(camera, pc, pipe, scaling)
     scene = scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background, scaling), raw)
@@ -218,21 +223,21 @@ def draw(
 
 @torch.no_grad()
 def wake(sleeping: Sleeping, camera: Camera, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> None:
-    """Wake the blocks of a model that a view may show, before a step by `render`."""
+    """Wake the blocks of a model that a view may show, before a step that uses `render`."""
     gaussians, raw = model_inputs(camera, pc, pipe)
     sleeping.wake(scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background), raw))
 
 
 @torch.no_grad()
-def shown_by(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """Gaussians of this process that reach a tile of a view: (N,) bool."""
+def visible_mask(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
+    """Mark this process's Gaussians that reach a tile of a view: (N,) bool."""
     gaussians, raw = model_inputs(camera, pc, pipe)
     settings = rasterizer_settings(camera, pc, pipe, pc.get_xyz.new_zeros(3))
     return OPERATORS.project(*scene_arguments(gaussians, settings, raw))[3] > 0
 
 
 def decisive_for(camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
+    """Mark the Gaussians that the image of `render` depends on, over any background (`decisive`): (N,) bool."""
     return draw(camera, pc, pipe, pc.get_xyz.detach().new_zeros(3), by_bands=True).decisive()
 
 
@@ -275,9 +280,9 @@ def rasterizer_settings(
 
 
 def _enlarged(camera: Camera | MiniCam, pc: GaussianModel) -> tuple[Tensor, Tensor]:
-    """The camera's matrices, of a frame that is larger than the world's by a model's enlargement.
+    """The camera's matrices in a frame that is larger than the world's by a model's enlargement.
 
-    Only the nearest depth that is drawn then is another.
+    Only the nearest depth that is drawn changes.
     """
     view, full, factor = camera.world_view_transform, camera.full_proj_transform, enlargement_of(pc)
     if factor == 1:
@@ -285,19 +290,19 @@ def _enlarged(camera: Camera | MiniCam, pc: GaussianModel) -> tuple[Tensor, Tens
     return torch.cat((factor * view[:, :3], view[:, 3:]), dim=1), factor * full
 
 
-def in_world_units(inverse_depth: Tensor | None, pc: GaussianModel) -> Tensor | None:
-    """Inverse depth by the world's unit, from the rasterizer's. By autograd, gradients go the other way."""
+def to_world_units(inverse_depth: Tensor | None, pc: GaussianModel) -> Tensor | None:
+    """Convert inverse depth, or its gradient, from the rasterizer's unit to the world's; differentiable."""
     factor = enlargement_of(pc)
     return inverse_depth if inverse_depth is None or factor == 1 else factor * inverse_depth
 
 
 def enlargement_of(pc: GaussianModel) -> float:
-    """Of a model, which may be of other code."""
+    """The enlargement of a model; 1 for a model of other code that has none."""
     return getattr(pc, "enlargement", 1.0)
 
 
-def exposed(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
-    """The image (3, H, W) with the trained exposure of the view's photo; a view without a photo has none."""
+def apply_trained_exposure(color: Tensor, camera: Camera | MiniCam, pc: GaussianModel) -> Tensor:
+    """Apply the trained exposure of the view's photo to an image (3, H, W); without a photo, return it unchanged."""
     name = photo_name(camera)
     if name is not None and (shown := getattr(getattr(pc, "exposures", None), "shown", None)):
         return shown(color, name)
@@ -311,10 +316,10 @@ def photo_name(camera: Camera | MiniCam) -> str | None:
 
 
 def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tuple[dict[str, Tensor], bool]:
-    """Shapes and opacities, and whether they are raw, so that the kernels activate them.
+    """Return shapes and opacities, and whether they are raw, so that the kernels activate them.
 
-    The kernels are faster and give the same bits for any number of threads. They take activated values of a model that
-    has activations of its own, or is of another class, even one that hands every other name on to a model of ours.
+    The kernels are faster and give the same bits for any number of threads. A model with activations of its own, or of
+    another class, even one that wraps a model of ours, gives activated values.
     """
     check_flags(compute_cov3D_python=in_python)
     if in_python:

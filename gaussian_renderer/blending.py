@@ -48,8 +48,10 @@ def view_planes(
 ) -> dict[str, Tensor]:
     """`depth` and `alpha` of a view, (1, H, W) float32 each, by the weights w_i of the image's Gaussians.
 
-    depth: inverse depth, the sum of w_i / z_i, per world unit; z_i is the depth of a mean. Where alpha is below 1 it is
-    that much smaller, so divide it by alpha to get that of what is there. alpha: the sum of w_i, in [0, 1].
+    depth: inverse depth, the sum of w_i / z_i, per world unit; z_i is the depth of a mean. Divided by alpha, it is the
+    mean inverse depth of the visible Gaussians.
+    alpha: the sum of w_i, in [0, 1].
+
     scaling: factor of all scales.
     """
     white = gaussians.get_xyz.new_ones(len(gaussians), 3)
@@ -62,9 +64,10 @@ def view_planes(
 def blend_depth(
     camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, scaling: float = 1.0
 ) -> Tensor:
-    """(H, W) int32: how far down its tile's list a pixel goes, up to the last Gaussian that is blended into it.
+    """Count the entries of its tile's list up to the last Gaussian that is blended into a pixel: (H, W) int32.
 
-    This is the work of the pixel. Gaussians of the tile that miss the pixel count, those behind the last one do not.
+    The count is the pixel's work: Gaussians of the tile that miss the pixel count, those behind the last one do not.
+
     scaling: factor of all scales.
     """
     return draw(camera, gaussians, pipe, gaussians.get_xyz.new_zeros(3), scaling=scaling).blend_depth

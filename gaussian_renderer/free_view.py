@@ -1,4 +1,4 @@
-"""Views without a photo: from any pose, and between neighbouring cameras, where a visitor of the scene may stand."""
+"""Views without a photo: from any pose, and between neighbouring cameras, where a visitor may stand."""
 
 import math
 from collections.abc import Sequence
@@ -17,8 +17,10 @@ WIDER = 1.5  # size of a view between, in sizes of its cameras: a visitor may lo
 def free_view(
     width: int, height: int, fov_y: float, position: Sequence[float], wxyz: Sequence[float], device: torch.device | str
 ) -> MiniCam:
-    """A view of square pixels. fov_y: radians. position: of the camera in the world.
+    """Make a view with square pixels.
 
+    fov_y: vertical opening angle, radians.
+    position: the camera's centre in the world.
     wxyz: unit quaternion that turns camera axes (x right, y down, z forward) into world axes.
     """
     fov_x = 2 * math.atan(math.tan(fov_y / 2) * width / height)
@@ -36,7 +38,7 @@ def _view(
     project: torch.Tensor,
     device: torch.device | str,
 ) -> MiniCam:
-    """turn: from camera axes to world axes. project: the projection matrix."""
+    """Make a view. turn: rotation from camera to world axes. project: the projection matrix."""
     view = torch.from_numpy(world_to_camera(turn, -turn.T @ center))
     matrices = [m.T.to(device, torch.float32).contiguous() for m in (view, project @ view)]
     return MiniCam(width, height, fov_y, fov_x, ZNEAR, ZFAR, *matrices)
@@ -57,8 +59,8 @@ def rotation_matrix(wxyz: Sequence[float]) -> np.ndarray:
 def neighbours(cameras: Sequence[Camera], nearest: int = NEAREST) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of cameras to walk between, by their index; ascending.
 
-    A pair's distance is that of the centres plus the angle between the orientations, each in units of its median over
-    all pairs. Each camera is paired with its `nearest` ones. The minimum spanning tree comes on top, so that groups of
+    A pair's distance is the distance of the centres plus the angle between the orientations, each divided by its median
+    over all pairs. Each camera is paired with its `nearest` ones; the minimum spanning tree is added, so that groups of
     cameras far from each other are joined, too. Memory: some 50 bytes for each two cameras.
     """
     from scipy.sparse.csgraph import minimum_spanning_tree  # SciPy takes a while to import
@@ -90,7 +92,7 @@ def _distances(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def views_between(first: Camera, second: Camera) -> list[MiniCam]:
-    """A view at each of FRACTIONS of the way between two cameras, WIDER than they are.
+    """Make a view at each of FRACTIONS of the way between two cameras, WIDER than they are.
 
     Positions, focal lengths and principal points are interpolated linearly, orientations along the shortest rotation
     (slerp). Where the sizes differ, the larger width and height count.

@@ -1,11 +1,12 @@
-"""Which Gaussians a model needs most: an order of them whose every first part is a model.
+"""An order of a model's Gaussians by need: the first n, for any n, are a model, too.
 
 Without a Gaussian a pixel changes by the opacity times minus its derivative, exactly, as it is linear in each opacity.
 A view's squared error against the whole model's image then changes by a sum over pixels of 2 E d + d^2, with E the
 error of those that went before, and d the change. The first term is one backward. The second is the mean square of a
 sum with random signs (Hutchinson 1990), so it is another one. The sum over the views is what a Gaussian adds.
 
-Those that go together hide the same pixels, so few go at a time, and the others are asked again in what is left.
+Gaussians that are removed together may hide the same pixels. So few are removed at a time, and the sums are computed
+again for the rest.
 """
 
 from collections.abc import Sequence
@@ -32,23 +33,20 @@ _ALIKE = 0.125  # of the count asked for: the last ones are not asked again
 
 
 def change_without(values: Tensor, gaussians: GaussianModel, factors: Tensor | None = None) -> Tensor:
-    """(N,) float64: how much a sum of rendered values times factors changes without a Gaussian, by the derivative."""
+    """The change of a sum of rendered values times factors without each Gaussian, by the derivative: (N,) float64."""
     (slope,) = torch.autograd.grad(values, gaussians.raw("opacity"), factors, retain_graph=True)
     return _removal(slope, gaussians)
 
 
 def _removal(slope: Tensor, gaussians: GaussianModel) -> Tensor:
-    """(N,) float64: opacity times minus the derivative, from that by its logit, (N, 1)."""
+    """Opacity times minus the derivative by it, from the derivative by its logit (N, 1): (N,) float64."""
     transparency = (1 - gaussians.get_opacity.detach()[:, 0]).clamp_min(_SOLID)
     return -(slope[:, 0] / transparency).double()
 
 
 @torch.no_grad()
 def most_needed(gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, count: int) -> Tensor:
-    """Indices (n,) int64 of the `count` Gaussians, or of all, that the views need most; the most needed comes first.
-
-    The first ones of them, however many, are a model, too.
-    """
+    """Indices (n,) int64 of the `count` Gaussians, or of all, that the views need most, the most needed first."""
     count = min(count, len(gaussians))
     signs = torch.Generator(gaussians.get_xyz.device).manual_seed(0)
     left, gone, squares = torch.arange(len(gaussians), device=gaussians.get_xyz.device), [], None
@@ -73,7 +71,7 @@ def most_needed(gaussians: GaussianModel, cameras: Sequence[Camera], views: Scor
 def _terms(
     camera: Camera, part: GaussianModel, views: ScoredViews, whole: Tensor, signs: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """Both terms, (N,) float64, of how the mean squared error of a part's view against the whole's grows."""
+    """Both terms (N,) float64 of the growth of the mean squared error of a part's view against the whole model's."""
     with torch.enable_grad():
         image = views.image(camera, part)
     mask = views.mask(camera)

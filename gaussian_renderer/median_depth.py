@@ -1,4 +1,4 @@
-"""Depth of the surface in a view: where half of a ray's light is absorbed, and not the mean of all that absorbs it.
+"""Median depth of a view: the depth at which half of a ray's light is absorbed.
 
 The Gaussians of a view are divided by their depths into slabs of equal numbers. An image is linear in what Gaussians
 carry, so one image of two channels a slab has the sums of its blending weights, and of weights times depths. The slab
@@ -32,7 +32,7 @@ class Surface(NamedTuple):
 
 @torch.no_grad()
 def surface_of(camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace) -> Surface:
-    """The median depth and the colours, over black, of a view without a lens."""
+    """Compute the median depth and the colours, over black, of a view without a lens."""
     means = gaussians.get_xyz
     clip = means @ camera.full_proj_transform[:, [0, 1, 3]][:3] + camera.full_proj_transform[3, [0, 1, 3]]
     depths = clip[:, 2].contiguous()
@@ -52,7 +52,7 @@ def surface_of(camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argpars
 
 
 def _median(weights: Tensor, depths: Tensor) -> Tensor:
-    """(H, W) from the sums (SLABS, H, W) of weights, and of weights times depths."""
+    """The median depth (H, W) from the sums (SLABS, H, W) of weights, and of weights times depths."""
     reached = weights.cumsum(0)
     found = (reached < _HALF).sum(0, keepdim=True).clamp_max(SLABS - 1)
     mean = depths.gather(0, found) / weights.gather(0, found)

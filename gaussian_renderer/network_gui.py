@@ -1,7 +1,7 @@
 """The remote viewer's side of a training: a socket that listens, one viewer, its requests and their answers.
 
-The names are the reference's, so that training loops written for it work. `conn` is the viewer's socket, None while
-nobody is connected; a loop may set it to None to drop the viewer. The protocol has no password.
+The names are the reference's, so that training loops written for the reference work. `conn` is the viewer's socket,
+None while nobody is connected; a loop may set it to None to drop the viewer. The protocol has no password.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from scene.cameras import MiniCam
 from utils.system_utils import UserError
 
 PATIENCE = 30.0  # seconds that `read` waits for a viewer that lets training go on, or has not asked for anything yet
-FIRST = 10.0  # seconds after which `is_asked` ends a connection that has not asked for anything
+FIRST = 10.0  # seconds after which `has_request` ends a connection that has not asked for anything
 
 conn: socket.socket | None = None
 addr: Any = None
@@ -34,7 +34,7 @@ port = 6009
 
 @dataclass
 class _Viewer:
-    """What the connected viewer has said so far."""
+    """State of the connected viewer, from its requests so far."""
 
     since: float = 0.0
     has_asked: bool = False
@@ -46,10 +46,10 @@ _viewer = _Viewer()
 
 
 def init(wish_host: str, wish_port: int, chosen: bool = True) -> None:
-    """Listen at an address; port 0: any free one, which is printed. What cannot be had is one warning on stderr.
+    """Listen at an address; port 0: any free one, which is printed. A failure is one warning on stderr.
 
-    `host` and `port` become the wish, and `port` the one that was found. chosen: whether somebody chose the address;
-    if not, nothing is said of a port that another program has, as the second of two trainings finds.
+    `host` and `port` become the wish, and `port` the one that was found. chosen: whether the user chose the address; if
+    not, a port that is taken, as in the second of two trainings, causes no warning.
     """
     global host, port, listener
     close()
@@ -74,7 +74,7 @@ def init(wish_host: str, wish_port: int, chosen: bool = True) -> None:
 
 
 def close() -> None:
-    """Let the viewer go, and listen no longer."""
+    """Disconnect the viewer, and stop listening."""
     global listener
     disconnect()
     if listener is not None:
@@ -84,7 +84,7 @@ def close() -> None:
 
 @contextlib.contextmanager
 def listening(wish_host: str, wish_port: int, chosen: bool = True) -> Iterator[None]:
-    """Within it, listen at an address (`init`)."""
+    """Listen at an address (`init`) inside the block."""
     init(wish_host, wish_port, chosen)
     try:
         yield
@@ -107,10 +107,10 @@ def try_connect() -> None:
     tqdm.write(f"viewer {_name()} connected", file=sys.stdout)
 
 
-def is_asked(seconds: float = 0.0) -> bool:
-    """Whether the viewer sends something, or leaves, within so many seconds; False while nobody is connected.
+def has_request(seconds: float = 0.0) -> bool:
+    """Tell whether the viewer sends a request, or leaves, within `seconds`; False while nobody is connected.
 
-    A viewer that has not asked for anything after FIRST seconds is let go.
+    A viewer that has sent nothing after FIRST seconds is disconnected.
     """
     if conn is None:
         return False
@@ -121,24 +121,24 @@ def is_asked(seconds: float = 0.0) -> bool:
     return False
 
 
-def holds(last: bool) -> bool:
-    """Whether the viewer wants training to wait. last: in the last iteration, where keep_alive does so, too."""
+def wants_wait(last: bool) -> bool:
+    """Tell whether the viewer wants training to wait. last: in the last iteration, when keep_alive waits, too."""
     return conn is not None and not (_viewer.train and not (last and _viewer.keep_alive))
 
 
 def read() -> dict[str, Any]:
-    """Wait for the viewer's next message; its JSON object, unchecked.
+    """Wait for the viewer's next message and return its JSON object, unchecked.
 
     ViewerLost, with a line on stderr, once the connection has ended; UserError while nobody is connected.
     """
     with _connection():
-        if not readable(conn, None if holds(last=False) else PATIENCE):
+        if not readable(conn, None if wants_wait(last=False) else PATIENCE):
             raise ViewerLost(f"it has sent nothing for {PATIENCE:g} s")
         return decode(receive_message(conn))
 
 
 def receive_request() -> Request | None:
-    """Wait for the viewer's next request; None for one without a frame. Errors as in `read`."""
+    """Wait for the viewer's next request; None for a request without a frame. Errors as in `read`."""
     message = read()
     with _connection():
         request = parse(message)
@@ -167,7 +167,7 @@ def send(message_bytes: bytes | memoryview | None, verify: str) -> None:
 
 
 def disconnect(fault: str | None = None) -> None:
-    """Let the viewer go, with a line. fault: why, if it is the viewer's fault."""
+    """Disconnect the viewer, with a message. fault: the reason, if it is the viewer's fault."""
     global conn, addr
     if conn is None:
         return
@@ -182,7 +182,7 @@ def disconnect(fault: str | None = None) -> None:
 
 @contextlib.contextmanager
 def _connection() -> Iterator[None]:
-    """Within it, a fault of the viewer ends the connection."""
+    """Disconnect the viewer at an error of its own inside the block."""
     if conn is None:
         raise UserError("no viewer is connected; call network_gui.try_connect() until `conn` is not None")
     try:

@@ -1,4 +1,4 @@
-"""Requests of the remote viewer: text in, checked values out. Nothing here knows a socket."""
+"""Parse requests of the remote viewer: text in, checked values out. No sockets here."""
 
 import json
 import math
@@ -41,13 +41,13 @@ class Request:
     keep_alive: bool  # stay after the last iteration
 
     def camera(self, device: torch.device) -> MiniCam:
-        """The view that is asked for."""
+        """Make the view that the request asks for."""
         matrices = self.view.to(device), self.view_projection.to(device)
         return MiniCam(self.width, self.height, self.fov_y, self.fov_x, self.z_near, self.z_far, *matrices)
 
 
 def decode(text: bytes) -> dict[str, Any]:
-    """The JSON object of a message. BadMessage if it is none."""
+    """Parse the JSON object of a message. BadMessage if it is none."""
     try:
         message = json.loads(text.decode("utf-8"))
     except (ValueError, RecursionError) as error:  # wrong UTF-8, wrong JSON or a number of too many digits
@@ -58,10 +58,10 @@ def decode(text: bytes) -> dict[str, Any]:
 
 
 def parse(message: dict[str, Any]) -> Request | None:
-    """The request that a message holds; None if a resolution is 0, when no other field is read.
+    """Make the request of a message; None if a resolution is 0, when no other field is read.
 
     BadMessage for a field that is missing, of another type, not finite or out of range, and for a view matrix that is
-    singular, mirrored or sheared. A scale of it is divided out.
+    singular, mirrored or sheared. A scale in the matrix is divided out.
     """
     width, height = (_size(message, f"resolution_{axis}") for axis in "xy")
     if width == 0 or height == 0:
@@ -127,7 +127,7 @@ def _finite(value: Any, name: str) -> float:
 
 
 def _matrix(message: dict[str, Any], name: str) -> Tensor:
-    """Sixteen numbers, row by row, as (4,4) float32 on the CPU."""
+    """Read sixteen numbers, row by row, as (4,4) float32 on the CPU."""
     values = _field(message, name)
     if type(values) is not list or len(values) != 16:
         raise BadMessage(f"its {name} is not a list of 16 numbers")

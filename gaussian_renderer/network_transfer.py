@@ -1,4 +1,4 @@
-"""Messages over a viewer's connection, with limits of time and length so that no viewer can hold training for good."""
+"""Messages over a viewer's connection, with limits of time and length so that no viewer can block training for ever."""
 
 import contextlib
 import math
@@ -20,11 +20,11 @@ _KEEP_ALIVE = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 4}  # seco
 
 
 class ViewerLost(Exception):
-    """A connection that cannot go on. Its text says why."""
+    """An error that ends a connection. Its text is the reason."""
 
 
 class ViewerLeft(ViewerLost):
-    """A connection that the viewer has closed between two messages."""
+    """The error for a connection that the viewer has closed between two messages."""
 
 
 def set_up(conn: socket.socket) -> None:
@@ -37,9 +37,9 @@ def set_up(conn: socket.socket) -> None:
 
 
 def readable(sock: socket.socket, seconds: float | None = 0.0) -> bool:
-    """Whether bytes, the end of the connection or, of a listener, a connection are there within so many seconds.
+    """Tell whether bytes, the connection's end or, at a listener, a new connection arrive within `seconds`.
 
-    None: wait without end. Takes less than a microsecond if it need not wait.
+    seconds: None waits without end. Without a wait, the call takes less than a microsecond.
     """
     left = math.inf if seconds is None else seconds
     while left > _LOOK:
@@ -58,7 +58,7 @@ def _readable(sock: socket.socket, seconds: float) -> bool:
 
 
 def receive_message(conn: socket.socket) -> bytes:
-    """The bytes of a message after its length. ViewerLeft if none comes any more, ViewerLost if half of it does."""
+    """Receive the bytes of a message after its length. ViewerLeft if none comes, ViewerLost after a part of one."""
     end = time.monotonic() + LONGEST
     head = _receive(conn, 4, end)
     if not head:
@@ -73,14 +73,14 @@ def receive_message(conn: socket.socket) -> bytes:
 
 
 def send_message(conn: socket.socket, frame: bytes | memoryview, text: bytes) -> None:
-    """Send a frame as it is, then a text after its length. ViewerLost if the viewer does not take them."""
+    """Send a frame without its length, then a text after its length. ViewerLost if the viewer does not take them."""
     end = time.monotonic() + LONGEST
     _send(conn, frame, end)
     _send(conn, struct.pack("<I", len(text)) + text, end)
 
 
 def _receive(conn: socket.socket, count: int, end: float) -> bytes:
-    """So many bytes, or fewer if the connection ends before."""
+    """Receive `count` bytes, or fewer if the connection ends before."""
     received = bytearray()
     while len(received) < count:
         with _limited(conn, end):
@@ -100,7 +100,7 @@ def _send(conn: socket.socket, data: bytes | memoryview, end: float) -> None:
 
 @contextlib.contextmanager
 def _limited(conn: socket.socket, end: float) -> Iterator[None]:
-    """Within it, one call may take SILENCE seconds, and none once `end` is reached; a failure is a ViewerLost."""
+    """Let a call in the block take SILENCE seconds, but not past the time `end`; raise a failure as ViewerLost."""
     try:
         left = end - time.monotonic()
         if left <= 0:

@@ -1,4 +1,4 @@
-"""Views that --projection ray cannot draw, found before anything is written."""
+"""A check for views that --projection ray cannot draw, before anything is written."""
 
 import argparse
 from collections.abc import Callable, Iterable
@@ -13,9 +13,9 @@ from utils.system_utils import UserError
 def check_views(
     pipe: argparse.Namespace, views: Iterable[Camera], size_of: Callable[[Camera], tuple[int, int]] | None = None
 ) -> None:
-    """Refuse a view whose lens has no rays that the kernels find (UserError).
+    """Refuse a view whose lens has rays that the kernels cannot find (UserError).
 
-    size_of: the size (width, height) in which a view is drawn, None: its own.
+    size_of: the size (width, height) in which a view is drawn; None: the view's own.
     """
     if getattr(pipe, "projection", "ewa") != "ray":
         return

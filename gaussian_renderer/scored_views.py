@@ -1,4 +1,4 @@
-"""Scores of views against their photos: the one place that knows half images, exposures, masks and targets."""
+"""Scores of views against their photos, with half images, exposures, masks and targets."""
 
 import argparse
 from collections.abc import Callable, Iterable
@@ -17,10 +17,12 @@ from utils.loss_utils import l1_and_ssim
 class ScoredViews:
     """Renders of views and their targets, as they are scored.
 
-    halves: only right halves count, and they are rendered with exposures (the half-image protocol). Photos that the
-    model's exposures cover are rendered as these show them, too.
-    draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render` does. whole: the same, the render before
-    `part` cuts it. pipe: the pipeline options.
+    A view of a photo that the model's exposures cover is rendered with its exposure.
+
+    pipe: the pipeline options.
+    halves: only right halves count, rendered with exposures (the half-image protocol).
+    draw: renders a camera and a model to (3, H, W) in [0, 1]; None: `render`.
+    whole: the whole image of `draw`, before `part` cuts it.
     """
 
     def __init__(
@@ -36,7 +38,7 @@ class ScoredViews:
         self.whole = draw or self._render
 
     def _render(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
-        exposed = self.halves or shown_as_trained(camera, gaussians)
+        exposed = self.halves or has_trained_exposure(camera, gaussians)
         options = {"use_trained_exp": exposed, "want_depth": False, "want_visibility": False}
         return render(camera, gaussians, self.pipe, self._background, **options)["render"]
 
@@ -49,7 +51,7 @@ class ScoredViews:
         return self.part(self.whole(camera, gaussians))
 
     def target(self, camera: Camera) -> Tensor:
-        """The scored part of `Camera.target`, which the render should equal."""
+        """The scored part of `Camera.target`."""
         return self.part(camera.target(self._background))
 
     def mask(self, camera: Camera) -> Tensor | None:
@@ -63,24 +65,24 @@ class ScoredViews:
         self.mask(camera)
 
     def compared(self, camera: Camera, gaussians: GaussianModel) -> tuple[Tensor, Tensor, Tensor | None]:
-        """Render, target and mask, as `mean_scores` takes them."""
+        """Return render, target and mask for `mean_scores`."""
         return self.image(camera, gaussians), self.target(camera), self.mask(camera)
 
     def scores(self, cameras: Iterable[Camera], gaussians: GaussianModel) -> dict[str, float]:
-        """`mean_scores` of views."""
+        """Return `mean_scores` of views."""
         return mean_scores(self.compared(camera, gaussians) for camera in cameras)
 
 
-def shown_as_trained(camera: Camera, gaussians: GaussianModel) -> bool:
-    """Whether a view is one of a photo that the model's exposures cover."""
+def has_trained_exposure(camera: Camera, gaussians: GaussianModel) -> bool:
+    """Tell whether a view's photo has a trained exposure that every render applies."""
     exposures = getattr(gaussians, "exposures", None)
     return exposures is not None and exposures.covers(photo_name(camera))
 
 
-def beside_test(
+def extra_test_views(
     scene: Any, pipe: argparse.Namespace, background: Tensor
 ) -> dict[str, tuple[ScoredViews | None, list[Camera]]]:
-    """Test views as parts score them besides, by the end of the set's name: how, None: as all others; and the views.
+    """Further test views that parts score, by suffix of the set's name: the scoring (None: the usual) and the views.
 
     A scene of other code has none.
     """
@@ -89,14 +91,15 @@ def beside_test(
 
 
 def mean_scores(compared: Iterable[tuple[Tensor, Tensor, Tensor | None]]) -> dict[str, float]:
-    """`l1`, `psnr` (dB) and `ssim` of (render, target, mask), each the mean over these; {} without any.
+    """Mean `l1`, `psnr` (dB) and `ssim` over tuples (render, target, mask); {} without any.
 
+    render: (3, H, W) float32 in [0, 1].
+    target: the same, or uint8 meaning value / 255.
     mask: (1, H, W) bool, the pixels that count, or None (utils/loss_utils.py); a view in which none counts is left out.
-    render: (3, H, W) float32 in [0, 1]; target: the same, or uint8 meaning value / 255. PSNR is from one mean squared
-    error over pixels and channels of a pair; pairs that are equal are left out of it, and without others there is no
-    `psnr`. metrics.py scores the same views from 8-bit
-    PNGs, with rounded renders; the training report takes the mean of the three channels' PSNRs. Without masks it waits
-    for a GPU once.
+
+    PSNR comes from one mean squared error over pixels and channels of a pair. Equal pairs are left out of its mean, and
+    without others there is no `psnr`. metrics.py scores the same views from 8-bit PNGs; the training report takes the
+    mean of the three channels' PSNRs. Without masks, the function waits for a GPU once.
     """
     scores = []
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Removal of what a finished model does not need: Gaussians that nobody sees, needless SH bands."""
+"""Removal of unseen Gaussians and needless SH bands from a finished model."""
 
 import argparse
 import math
@@ -27,7 +27,7 @@ KEPT, TOO_LONG, FEW, DONE = "not wanted", "too long", "too few", "done"  # ends 
 
 @dataclass
 class Search:
-    """What a search for unseen Gaussians found, and what was then left out."""
+    """The result of a search for unseen Gaussians, and of their removal."""
 
     keep: Tensor  # (N,) bool
     faint: int = 0  # Gaussians of an opacity below 1/255
@@ -39,7 +39,7 @@ class Search:
 
 
 def decisive_for_any(cameras: Sequence[Camera | MiniCam], gaussians: GaussianModel, pipe: argparse.Namespace) -> Tensor:
-    """(N,) bool: the Gaussians that the image of any camera, at its size, depends on."""
+    """Mark the Gaussians that the image of any camera, at its size, depends on: (N,) bool."""
     found = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     for camera in Bar(cameras, desc="Looking for unseen Gaussians", unit="view", leave=False):
         found |= decisive_for(camera, gaussians, pipe)
@@ -47,14 +47,14 @@ def decisive_for_any(cameras: Sequence[Camera | MiniCam], gaussians: GaussianMod
 
 
 def fewest_views(cameras: Sequence[Camera]) -> int:
-    """How many views a walk along the minimum spanning tree of the cameras makes, with the cameras themselves."""
+    """Number of views of a walk along the minimum spanning tree of the cameras, with the cameras themselves."""
     return (1 + len(FRACTIONS)) * len(cameras) - len(FRACTIONS)
 
 
-def walk(cameras: Sequence[Camera], most: float) -> tuple[list[tuple[int, int]], int]:
-    """Pairs of cameras to walk between, and how many views that makes with the cameras themselves.
+def walk_pairs(cameras: Sequence[Camera], most: float) -> tuple[list[tuple[int, int]], int]:
+    """Choose pairs of cameras to walk between; return them and the number of views, with the cameras themselves.
 
-    As many neighbours count, up to NEAREST, as need at most `most` views; the fewest, if none do.
+    Each camera has up to NEAREST neighbours, as many as give at most `most` views; if none do, as few as possible.
     """
     pairs, views = [], fewest_views(cameras)
     for nearest in range(NEAREST, -1, -1) if views <= most else ():
@@ -68,31 +68,31 @@ def walk(cameras: Sequence[Camera], most: float) -> tuple[list[tuple[int, int]],
 def search_unseen(
     gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, iterations: int
 ) -> Search:
-    """Find the Gaussians that no one sees who walks from camera to camera.
+    """Find the Gaussians that are invisible on a walk from camera to camera.
 
-    Those below FAINT are in no image at all. Of the others, those are unseen that neither the cameras nor the views
-    between neighbouring ones depend on (gaussian_renderer/free_view.py). If they are fewer than WORTH, or if looking
-    takes more than a view for ITERATIONS_PER_VIEW of the `iterations` trained, they are kept.
+    Gaussians below FAINT are in no image at all. Others are unseen if neither a camera nor a view between neighbouring
+    cameras depends on them (gaussian_renderer/free_view.py). They are kept if they are fewer than WORTH, or if the
+    search takes more than one view for ITERATIONS_PER_VIEW of the `iterations` trained.
     """
     keep = gaussians.raw("opacity").detach()[:, 0] >= FAINT
     shards = gaussians.shards
-    search = Search(keep, faint=shards.marked(~keep))
+    search = Search(keep, faint=shards.count_marked(~keep))
     most, search.views = iterations / ITERATIONS_PER_VIEW, fewest_views(cameras)
     if search.views > most:
         search.end = TOO_LONG
         return search
     seen, search.views = decisive_for_any(cameras, gaussians, pipe), len(cameras)
     # To find neighbours loads SciPy, which takes longer than the search of most models.
-    enough = shards.marked(keep & ~seen) >= WORTH * gaussians.gaussian_count
-    pairs = walk(cameras, most)[0] if enough else []
+    enough = shards.count_marked(keep & ~seen) >= WORTH * gaussians.gaussian_count
+    pairs = walk_pairs(cameras, most)[0] if enough else []
     walks = chain.from_iterable(views_between(cameras[i], cameras[j]) for i, j in pairs)
     total = len(FRACTIONS) * len(pairs)
     for camera in Bar(walks, desc="Looking between", total=total, unit="view", leave=False, disable=not total):
-        if shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
+        if shards.count_marked(keep & ~seen) < WORTH * gaussians.gaussian_count:
             break
         seen |= decisive_for(camera, gaussians, pipe)
         search.views += 1
-    few = shards.marked(keep & ~seen) < WORTH * gaussians.gaussian_count
+    few = shards.count_marked(keep & ~seen) < WORTH * gaussians.gaussian_count
     search.end = FEW if few else DONE
     search.keep = keep if few else keep & seen
     return search
@@ -106,19 +106,25 @@ def trim(
     prune_sh: float,
     iterations: int,
 ) -> tuple[GaussianModel, Search]:
-    """Leave out what the training views `cameras` and those between them do not need: the model, and what was found.
+    """Copy a model without Gaussians and SH bands that the training views and views between them do not need.
 
-    `gaussians` does not change. keep_unseen: leave no Gaussian out. prune_sh: by how much cut SH bands may change a
-    colour (in [0, 1]); -1 cuts none, 0 those that are zero. iterations: of the training. Unless bands that are not zero
-    are cut, the renders of `cameras` keep every bit, or on a GPU change by rounding (see `decisive`).
+    Unless bands that are not zero are cut, the renders of `cameras` keep every bit, or on a GPU change by rounding (see
+    `decisive`).
+
+    cameras: the training views.
+    keep_unseen: leave no Gaussian out.
+    prune_sh: largest change of a colour (in [0, 1]) by cut SH bands; -1 cuts none, 0 those that are zero.
+    iterations: length of the training.
+
+    Returns the new model, and the result of the search.
     """
     start = time.perf_counter()
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
     search = Search(every) if keep_unseen else search_unseen(gaussians, cameras, pipe, iterations)
     shards = gaussians.shards
-    if not shards.marked(search.keep):  # never an empty model
+    if not shards.count_marked(search.keep):  # never an empty model
         search = Search(every, end=FEW)
-    search.unseen = shards.marked(~search.keep)
+    search.unseen = shards.count_marked(~search.keep)
     kept = search.keep if search.unseen else slice(None)
     search.cut_bounds = cut_bounds(gaussians.get_features_rest.detach(), shards, search.keep)
     degree = gaussians.max_sh_degree if prune_sh < 0 else needed_degree(search.cut_bounds, prune_sh)
@@ -132,9 +138,9 @@ def trim(
 def change_on_views(
     before: GaussianModel, after: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, scored: bool
 ) -> dict[str, float]:
-    """Difference between the renders of two models: `largest`, of a value in [0, 1].
+    """Compare the renders of two models: `largest` is the largest difference of a value in [0, 1].
 
-    scored: also `psnr_before` and `psnr_after`, dB.
+    scored: add `psnr_before` and `psnr_after`, dB.
     """
     change = {"largest": max(float((views.image(c, before) - views.image(c, after)).abs().max()) for c in cameras)}
     if scored:

@@ -1,4 +1,4 @@
-"""The one way in which the core, and a command at the root, call an application, whose folder may be deleted."""
+"""Calls of applications by the core and by the commands at the root. An application's folder may be deleted."""
 
 import sys
 from importlib import import_module

@@ -1,9 +1,9 @@
-"""What is wrong with a scene, a training, a model or an installation, and what to do: the rules, by their subject.
+"""Findings: faults of a scene, training, model or installation, with remedies. Rules by module:
 
 environment          packages, GPU, extensions (imports nothing heavy)
-photos, photo_files  what photos show; photos that are there twice, or blurred
+photos, photo_files  content of photos; duplicates and blur
 shared_pixels        parts of nearly all photos that are the same, such as a caption
-cameras, points      where they stand, and what no camera or cloud has
+cameras, points      positions, and impossible values of cameras and clouds
 fit                  lenses, units and poses that the tracks of structure from motion contradict
 scene                all of these in their order, for doctor.py and before a training
 capture              photos and poses of a conversion, and what to photograph again
@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 
 class Severity(IntEnum):
-    """How bad a finding is."""
+    """The severity of a finding."""
 
     FINE = 0  # all is well
     NOTE = 1  # for the user to judge
@@ -26,7 +26,7 @@ class Severity(IntEnum):
 
 
 class Finding(NamedTuple):
-    """What a rule finds. remedy: what to do about it. options: of train.py, for which it speaks."""
+    """The result of a rule. remedy: how to end the fault. options: options of train.py that the finding suggests."""
 
     text: str
     remedy: str = ""
@@ -35,12 +35,12 @@ class Finding(NamedTuple):
 
     @property
     def is_problem(self) -> bool:
-        """Whether something has to be done."""
+        """True if something has to be done."""
         return self.severity >= Severity.PROBLEM
 
     @property
     def line(self) -> str:
-        """As doctor.py prints it."""
+        """The line that doctor.py prints."""
         if self.is_problem:
             return f"PROBLEM {self.text}" + (f" -> {self.remedy}" if self.remedy else "")
         return f"{'note' if self.severity else 'ok':8}{self}"
@@ -59,6 +59,6 @@ def note(text: str, options: str = "") -> Finding:
 
 
 def from_error(error: Exception) -> Finding:
-    """That of a UserError, whose sentence has the form: fault; remedy."""
+    """Make a finding of a UserError, whose sentence has the form: fault; remedy."""
     text, semicolon, remedy = str(error).rpartition("; ")
     return Finding(text, remedy) if semicolon else Finding(remedy, "fix that and check again")

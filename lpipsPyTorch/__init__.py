@@ -11,7 +11,7 @@ __all__ = ["lpips"]
 
 
 def lpips(x: Tensor, y: Tensor, net_type: str = "alex", version: str = "0.1") -> Tensor:
-    """Distance of images (B, 3, H, W) or (3, H, W), as the call of a `LPIPS` on the device of x: (1, 1, 1, 1).
+    """Distance of images (B, 3, H, W) or (3, H, W), computed by an `LPIPS` on the device of x: (1, 1, 1, 1).
 
     Networks are kept, so that only the first call with a net and a device takes long.
     """

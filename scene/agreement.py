@@ -1,4 +1,4 @@
-"""Is a model right? It is judged, without any truth, by the pairs of photos that it was made from.
+"""Judge a structure-from-motion model without ground truth, by the pairs of photos that it was made from.
 
 A pair of photos has matches that passed a geometric check of the pair alone. Under the poses and lenses of a model, and
 under the pair's own best geometry, they have an epipolar error. A pair contradicts the model where the first is much
@@ -37,9 +37,11 @@ _CALIBRATED = {
 
 
 class Pair(NamedTuple):
-    """Two photos of a model. error, own_error: medians (pixels) by the model and by the pair's own best geometry.
+    """Two photos of a model.
 
-    side: the longer one of the photos, pixels. behind: share of the matches that the model puts behind a photo.
+    error, own_error: median epipolar errors (pixels) by the model and by the pair's own best geometry.
+    side: the longest side of the photos, pixels.
+    behind: share of the matches that the model puts behind a photo.
     """
 
     first: str
@@ -52,21 +54,23 @@ class Pair(NamedTuple):
 
     @property
     def contradicts(self) -> bool:
-        """Whether the model cannot explain what the pair by itself can."""
+        """True if the model does not explain the pair's matches, though a geometry of the pair alone does."""
         return self.error > max(WORSE * self.own_error, FLOOR * self.side) or self.behind > _BEHIND
 
 
 def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
     """Judge a model by the verified pairs of a database whose focal lengths are calibrated; the result is JSON.
 
-    It is `verdict` with what pairs alone do not say. bound: the number of photos that pairs join to one another, those
-    without a pose, too. rotation: of rotation_error. alike: photos to leave out until no two stand in one place and
-    show different things. alike_pair: the clearest two of these, or None.
+    The result is `verdict` with further entries:
+    bound: number of photos that pairs connect, those without a pose included;
+    rotation: see rotation_error;
+    alike: photos to leave out so that no two stand in one place and show different things;
+    alike_pair: the clearest two of these, or None.
     """
     compared = sorted(find_overlaps(model, database), key=lambda pair: -pair.empty)
     alike = [pair[:2] for pair in compared if pair.is_unmatched]
     return verdict(list(pairs_of(model, database))) | {
-        "bound": len(joined(_linked(database))),
+        "bound": len(largest_component(_linked(database))),
         "rotation": rotation_error(database),
         "alike": find_cover(alike),
         "alike_pair": alike[0] if alike else None,
@@ -74,11 +78,13 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
 
 
 def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
-    """What pairs say of a model.
+    """Summarise the pairs of a model.
 
-    pairs: how many there are. contradicting: the share of their matches that belongs to pairs that contradict. error,
-    own_error: medians over pairs, pixels. agreeing: number of photos in the largest group. against: photos that
-    contradict this group; others may have no pair with it.
+    pairs: number of pairs;
+    contradicting: share of matches that belong to contradicting pairs;
+    error, own_error: medians over pairs, pixels;
+    agreeing: number of photos in the largest group;
+    against: photos that contradict this group; others may have no pair with it.
     """
     groups = consistent_groups(pairs)
     member = {name: number for number, group in enumerate(groups) for name in group}
@@ -110,7 +116,7 @@ def pairs_of(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
         if first in images and second in images and int(geometry.config) in _CALIBRATED:
             matches = geometry.inlier_matches
             seen = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
-            if pair := judged_pair(images[first], images[second], *seen):
+            if pair := judge_pair(images[first], images[second], *seen):
                 yield pair
     database.close()
 
@@ -118,7 +124,7 @@ def pairs_of(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
 def pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
     """Pairs of photos that share points of the model, where it has no database: for each photo those that share most.
 
-    They are of little weight where a program has left out what did not fit.
+    They prove little if a program has removed matches that did not fit.
     """
     images = {number: model.images[number] for number in model.reg_image_ids()}
     seen: dict[int, dict[int, int]] = {number: {} for number in images}
@@ -133,11 +139,11 @@ def pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
     for first, second in sorted(chosen):
         both = sorted(seen[first].keys() & seen[second].keys())
         matched = (rays[i][[seen[i][number] for number in both]] for i in (first, second))
-        if pair := judged_pair(images[first], images[second], *matched):
+        if pair := judge_pair(images[first], images[second], *matched):
             yield pair
 
 
-def judged_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, seen: np.ndarray) -> Pair | None:
+def judge_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, seen: np.ndarray) -> Pair | None:
     """Judge the unit rays (N, 3) of matches in two photos by the photos' poses; None if there are too few."""
     usable = np.isfinite(rays).all(1) & np.isfinite(seen).all(1)
     rays, seen = rays[usable], seen[usable]
@@ -179,7 +185,7 @@ def angles(essential: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> np.ndar
 def own_angles(rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """`angles` (N,) of the matrix that fits the rays best: the eight-point algorithm, robust by reweighting.
 
-    The matrix need not be essential, so that a wrong lens counts, and a plane, which several matrices fit, does not.
+    The matrix need not be essential: so a wrong lens shows, and a plane, which several matrices fit, does no harm.
     """
     # Spread over all directions by a change of axes, or the equations of a narrow view are nearly singular.
     one, other = (np.linalg.inv(np.linalg.cholesky(ray.T @ ray / len(ray) + 1e-12 * np.eye(3))) for ray in (rays, seen))
@@ -219,7 +225,7 @@ def consistent_groups(pairs: Iterable[Pair]) -> list[list[str]]:
     return sorted(groups.values(), key=lambda group: (-len(group), min(group)))
 
 
-def joined(links: Iterable[tuple[Any, Any]]) -> set[Any]:
+def largest_component(links: Iterable[tuple[Any, Any]]) -> set[Any]:
     """The largest set of things that links connect."""
     near: dict[Any, set[Any]] = {}
     for one, other in links:

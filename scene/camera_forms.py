@@ -1,4 +1,4 @@
-"""What other code gives in the form of either release of the reference: arguments of a Camera, records, functions."""
+"""Arguments, records and functions of other code, in the form of either release of the reference."""
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from torch import Tensor
 from scene.images.decode import picture_size, pixels_of
 from scene.images.masks import TRANSPARENT, add_alpha
 from scene.images.store import InMemory, Size
-from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, depth_fit, fitted
+from scene.readers.depth_maps import BLENDER_UNIT, COLMAP_UNIT, DepthMap, apply_fit, depth_fit
 from scene.readers.info import CameraInfo, as_camera_info
 from utils.general_utils import check_flags
 from utils.image_utils import half
@@ -23,16 +23,16 @@ NOT_MOVED = np.array([0.0, 0.0, 0.0])
 Arguments = tuple[tuple[CameraInfo, Size, int], dict[str, Any]]  # of a Camera made of a CameraInfo
 
 
-def of_either_form(*args: Any, **kwargs: Any) -> Arguments:
-    """Arguments of either form, told apart by `gt_alpha_mask`, or by the first argument: a size or an id.
+def parse_either_form(*args: Any, **kwargs: Any) -> Arguments:
+    """Parse arguments of a Camera in either form, told apart by `gt_alpha_mask`, or by the first: a size or an id.
 
     TypeError for arguments of neither form.
     """
     older = "gt_alpha_mask" in kwargs or (bool(args) and np.ndim(args[0]) == 0)
-    return _of_2023(*args, **kwargs) if older else _of_2024(*args, **kwargs)
+    return _parse_2023(*args, **kwargs) if older else _parse_2024(*args, **kwargs)
 
 
-def _of_2024(
+def _parse_2024(
     resolution: Sequence[int],
     colmap_id: int,
     R: np.ndarray,
@@ -51,7 +51,7 @@ def _of_2024(
     is_test_dataset: bool = False,
     is_test_view: bool = False,
 ) -> Arguments:
-    """Arguments of the newer release.
+    """Parse arguments of the newer release.
 
     resolution: (width, height) that the image is resized to, its alpha included. invdepthmap: (h,w) or (h,w,C), whose
     first channel counts, resized bilinearly. depth_params: as `depth_fit` takes them. train_test_exp: only a half of a
@@ -62,7 +62,7 @@ def _of_2024(
     depth: InMemory | None = None
     if invdepthmap is not None:
         fit, values = depth_fit(depth_params), np.asarray(invdepthmap, dtype=np.float64)
-        depth = InMemory(fitted(values[..., 0] if values.ndim > 2 else values, size, fit.scale, fit.offset))
+        depth = InMemory(apply_fit(values[..., 0] if values.ndim > 2 else values, size, fit.scale, fit.offset))
     info = CameraInfo(
         *(colmap_id, R, T, FoVy, FoVx, depth_params, "", image_name, "", *size),
         image=InMemory(pixels_of(image, size)),
@@ -72,7 +72,7 @@ def _of_2024(
     return (info, size, uid), {"columns": columns, "trans": trans, "scale": scale, "data_device": data_device}
 
 
-def _of_2023(
+def _parse_2023(
     colmap_id: int,
     R: np.ndarray,
     T: np.ndarray,
@@ -86,7 +86,7 @@ def _of_2023(
     scale: float = 1.0,
     data_device: str = "cuda",
 ) -> Arguments:
-    """Arguments of the release of 2023.
+    """Parse arguments of the release of 2023.
 
     image: (3,H,W), clamped to [0,1] and multiplied by gt_alpha_mask, (1,H,W) in [0,1], or None: opaque.
     """
@@ -99,13 +99,13 @@ def _of_2023(
     return (info, size, uid), {"trans": trans, "scale": scale, "data_device": data_device}
 
 
-SIGNATURE = inspect.signature(_of_2024).replace(return_annotation=inspect.Signature.empty)
+SIGNATURE = inspect.signature(_parse_2024).replace(return_annotation=inspect.Signature.empty)
 
 
-def of_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
-    """CameraInfo of any record with the reference's fields, whose photo and depth map are ready for training at a size.
+def info_from_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
+    """Make a CameraInfo of any record with the reference's fields, photo and depth map ready for training at a size.
 
-    A PIL image that it holds is resized. A file that `depth_path` names is a depth map with Blender's unit if the scene
+    A PIL image in the record is resized. A file that `depth_path` names is a depth map with Blender's unit if the scene
     is_nerf_synthetic, else with COLMAP's. UserError if that file is missing.
     """
     record = as_camera_info(record)
@@ -122,8 +122,8 @@ def of_record(record: Any, size: Size, is_nerf_synthetic: bool) -> CameraInfo:
     return record
 
 
-def call_of_either_form(function: Callable, newer: tuple, older: tuple) -> Any:
-    """Call a function that other code may have replaced by one of 2023, which takes fewer arguments."""
+def call_either_form(function: Callable, newer: tuple, older: tuple) -> Any:
+    """Call a function that may be other code's of 2023 and then takes the older, fewer arguments."""
     try:
         inspect.signature(function).bind(*newer)
     except TypeError:

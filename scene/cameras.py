@@ -1,6 +1,6 @@
 """Views by the reference's names: `Camera`, which has a photo and may be changed, and `MiniCam`, which has none.
 
-`utils.camera_utils` has the functions that make cameras, too; other code may replace them there (`replaced`).
+`utils.camera_utils` has the functions that make cameras, too; other code may replace them there (`find_replacement`).
 """
 
 import argparse
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from scene.camera_forms import NOT_MOVED, SIGNATURE, call_of_either_form, of_either_form, of_record
+from scene.camera_forms import NOT_MOVED, SIGNATURE, call_either_form, info_from_record, parse_either_form
 from scene.images.sizes import training_size
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo, photo_size
@@ -49,9 +49,9 @@ def _assignable(compute: Callable[["Camera"], Any]) -> property:
 class Camera(View, nn.Module):
     """A view that may be made, changed, copied and pickled as the reference's class of this name.
 
-    Made of the arguments of `scene.view.View`, and trans and scale, or of those of either release of the reference
-    (scene/camera_forms.py). trans, scale: moved the camera's centre c to (c + trans) * scale in the
-    matrices. data_device: where photos in memory lie, and the images and masks below that other code reads.
+    The arguments are those of `scene.view.View` with trans and scale, or of either release of the reference
+    (scene/camera_forms.py). trans, scale: the matrices put the camera's centre c at (c + trans) * scale. data_device:
+    device of photos in memory, and of the images and masks below that other code reads.
 
     All attributes may be assigned, and others added; nothing is computed again from an assigned one. An original_image
     or alpha_mask that was assigned or changed in place takes the place of the photo's in `target`. `del` of an
@@ -68,7 +68,7 @@ class Camera(View, nn.Module):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         nn.Module.__init__(self)
         if not (args and isinstance(args[0], CameraInfo)):
-            args, kwargs = of_either_form(*args, **kwargs)
+            args, kwargs = parse_either_form(*args, **kwargs)
         self.trans, self.scale = kwargs.pop("trans", NOT_MOVED), kwargs.pop("scale", 1.0)
         self._assigned: dict[str, Any] = {}
         self._made: dict[str, Tensor] = {}
@@ -120,7 +120,7 @@ class Camera(View, nn.Module):
 
     @property
     def has_dataset_pictures(self) -> bool:
-        """Whether its pictures are those of the dataset: nothing was assigned or changed in place."""
+        """True if no picture of the dataset was replaced or changed in place."""
         return not self._assigned and not self._edited
 
     def _float_pixels(self) -> Tensor:
@@ -139,7 +139,7 @@ class Camera(View, nn.Module):
 
     @property
     def _edited(self) -> bool:
-        """Whether other code changed the kept float pixels in place."""
+        """True if other code changed the kept float pixels in place."""
         return bool(self._made) and self._made["pixels"]._version != self._made_version
 
     def _target(self, pixels: Tensor, background: Tensor) -> Tensor:
@@ -180,7 +180,7 @@ class Camera(View, nn.Module):
 
     @_assignable
     def depth_reliable(self) -> bool:
-        """Whether there is an inverse depth map to train on."""
+        """Tell whether there is an inverse depth map to train on."""
         return self._reliable
 
     @_assignable
@@ -242,8 +242,8 @@ class MiniCam:
         self.camera_center = center.to(world_view_transform.device)
 
 
-def replaced(name: str) -> Callable[..., Any] | None:
-    """What other code has put in the place of a function below, in utils.camera_utils or in this package; else None."""
+def find_replacement(name: str) -> Callable[..., Any] | None:
+    """Find other code's replacement of a function below, in utils.camera_utils or in this package; else None."""
     ours, modules = globals()[name], filter(None, map(sys.modules.get, (__package__, "utils.camera_utils")))
     return next((own for module in modules if (own := vars(module).get(name, ours)) is not ours), None)
 
@@ -265,7 +265,7 @@ def loadCam(
     size = training_size(*photo_size(cam_info), args.resolution, resolution_scale)
     halved = getattr(args, "train_test_exp", False) and getattr(cam_info, "is_test", False)
     columns = half(size[0], is_test_dataset) if halved else None
-    return Camera(of_record(cam_info, size, is_nerf_synthetic), size, id, columns, data_device=args.data_device)
+    return Camera(info_from_record(cam_info, size, is_nerf_synthetic), size, id, columns, data_device=args.data_device)
 
 
 def cameraList_from_camInfos(
@@ -275,10 +275,10 @@ def cameraList_from_camInfos(
     is_nerf_synthetic: bool = False,
     is_test_dataset: bool = False,
 ) -> list[Camera]:
-    """`loadCam` of each view, or what other code has put in its place; their uids count from 0."""
-    load, of_2024 = replaced("loadCam") or loadCam, (is_nerf_synthetic, is_test_dataset)
+    """Call `loadCam`, or other code's replacement, for each view; uids count from 0."""
+    load, of_2024 = find_replacement("loadCam") or loadCam, (is_nerf_synthetic, is_test_dataset)
     older = [(args, uid, info, resolution_scale) for uid, info in enumerate(cam_infos)]
-    return [call_of_either_form(load, (*arguments, *of_2024), arguments) for arguments in older]
+    return [call_either_form(load, (*arguments, *of_2024), arguments) for arguments in older]
 
 
 def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:

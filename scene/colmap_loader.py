@@ -14,7 +14,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 import numpy as np
 
-from groundwork.files.plain_files import encoding_of, not_the_file
+from groundwork.files.plain_files import describe_wrong_file, encoding_of
 from utils.system_utils import UserError, first_line
 
 StrPath = str | os.PathLike
@@ -354,7 +354,7 @@ class _BinaryFile:
         return Points(rows["id"], rows["xyz"], rows["rgb"], rows["error"]), _Numbered("point", range(1, count + 1))
 
     def _cut_short(self, what: str, number: int, count: int) -> UserError:
-        fault = not_the_file(self.path)
+        fault = describe_wrong_file(self.path)
         fault = f"is {fault}" if fault else f"ends within {what} {number:,} of {count:,}, or is no such file"
         return UserError(f"{self.path} {fault}; copy the file again from where it was made")
 
@@ -390,7 +390,7 @@ class _TextFile:
             except (ValueError, OverflowError) as error:
                 if any("\udc80" <= letter <= "\udcff" for letter in self._line):
                     raise UserError(f"{self.path} is not UTF-8 text; rename its photos in plain letters") from error
-                if other := not_the_file(self.path):
+                if other := describe_wrong_file(self.path):
                     fault = f"{self.path} is {other}; copy the file again from where it was made"
                     raise UserError(fault) from error
                 raise UserError(

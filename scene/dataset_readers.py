@@ -35,7 +35,7 @@ from scene.readers.info import (
     scene_extent,
     world_offset,
 )
-from scene.readers.photos import finished
+from scene.readers.photos import to_pinholes
 from scene.readers.point_cloud import fetchPly, storePly, write_point_cloud
 from scene.readers.scene_folder import BLENDER, COLMAP, NERFSTUDIO, kind_of
 from scene.readers.start_cloud import SFM, StartOptions
@@ -118,7 +118,7 @@ def readColmapCameras(
     folder = Path(depths_params if old else images_folder)
     cameras = [colmap_camera(i, cam_intrinsics[i.camera_id], folder / i.name) for i in cam_extrinsics.values()]
     if any(camera.lens for camera in cameras):
-        cameras = finished(cameras)
+        cameras = to_pinholes(cameras)
     if old:
         return [_published(camera, of_2023=True) for camera in cameras]
     published = []
@@ -272,16 +272,16 @@ sceneLoadTypeCallbacks: dict[str, Callable[..., SceneInfo]] = {
 _OURS = dict(sceneLoadTypeCallbacks)
 
 
-def replaced_reader(kind: str) -> Callable[..., Any] | None:
-    """The reader that other code has put into `sceneLoadTypeCallbacks` for a kind of folder; None where ours stands."""
+def find_reader_replacement(kind: str) -> Callable[..., Any] | None:
+    """Find other code's reader for a kind of folder in `sceneLoadTypeCallbacks`; None if ours is there."""
     read = sceneLoadTypeCallbacks.get(kind)
     return None if read is _OURS.get(kind) else read
 
 
-def scene_by(read: Callable[..., Any], kind: str, args: argparse.Namespace) -> SceneInfo:
-    """The scene by a reader of other code, which is called with the reference's arguments.
+def read_scene_by(read: Callable[..., Any], kind: str, args: argparse.Namespace) -> SceneInfo:
+    """Read the scene by other code's reader, called with the reference's arguments.
 
-    It may return any record with the fields that a release of the reference has. kind: of the scene folder.
+    The reader may return any record with the fields that a release of the reference has. kind: the scene folder's.
     """
     depths = getattr(args, "depths", None) or ""
     if kind == COLMAP:

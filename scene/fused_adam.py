@@ -20,7 +20,7 @@ CAMERA_NUMBERS = 34  # of a camera with a lens; a pinhole has fewer (csrc/math/c
 
 
 class FusedAdam:
-    """Hands a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` says so.
+    """Passes a model's optimiser, and a penalty, to `apply_gradients_`. Make one only if `takes` is true.
 
     left_out: attributes that take no step.
     """
@@ -32,10 +32,10 @@ class FusedAdam:
 
     @staticmethod
     def takes(gaussians: GaussianModel) -> bool:
-        """Whether the operator steps this model as its own optimiser would.
+        """Tell whether the operator steps this model as the model's own optimiser would.
 
-        It does for a GaussianModel whose activations, getters, attributes and optimiser are ours, one group for each
-        attribute, without hooks.
+        True for a GaussianModel whose activations, getters, attributes and optimiser are ours, with one group for each
+        attribute and without hooks.
         """
         optimizer = gaussians.optimizer
         return (
@@ -54,7 +54,7 @@ class FusedAdam:
         camera: as for `apply`.
         """
         optimizer, stepping = self._gaussians.optimizer, list(self._stepping())
-        each = self._penalty.of_each(self._gaussians.gaussian_count)
+        each = self._penalty.per_value(self._gaussians.gaussian_count)
         *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
         return (
             [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],
@@ -93,9 +93,10 @@ class FusedAdam:
         OPERATORS.apply_gradients_(gaussians, view, *options, *arguments)
 
     def write_now(self, now: Tensor, iteration: int) -> None:
-        """Write what the next step stands for, (NOW_WORDS,) int64 on the CPU, and advance the step counters.
+        """Write the numbers of the next step, (NOW_WORDS,) int64 on the CPU, and advance the step counters.
 
-        A step that was recorded with a copy of it on the GPU (`Drawn.step`) then takes the step of `iteration`.
+        A step that was recorded with a copy of the numbers on the GPU (`Drawn.step`) then takes the step of
+        `iteration`.
         """
         stepping = list(self._stepping())
         attributes, steps = [one.attribute for one in stepping], [one.state["step"] for one in stepping]
@@ -103,7 +104,7 @@ class FusedAdam:
         OPERATORS.step_now_(now, attributes, steps, rates, *self._constants(), self._sparse, iteration)
 
     def places(self) -> tuple[int, ...]:
-        """Number of Gaussians, and where all tensors of a step lie, to see whether one was replaced."""
+        """Number of Gaussians, and addresses of all tensors of a step, to detect replaced tensors."""
         tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
         tensors += self._statistics()
         return len(self._gaussians), *[tensor.data_ptr() for tensor in tensors]
@@ -141,5 +142,5 @@ class _Stepping(NamedTuple):
 
 
 def _is_plain(param: Tensor) -> bool:
-    """Whether the operator takes the parameter, and nobody but the optimiser waits for its gradient."""
+    """Tell whether the operator can step the parameter, and only the optimiser uses its gradient."""
     return param.is_contiguous() and param.requires_grad and param.grad is None and not param._backward_hooks

@@ -28,7 +28,7 @@ _OPTIMIZERS = {"default": GaussianAdam, "sparse_adam": SparseGaussianAdam}
 
 
 class GaussianModel(ReferenceNames, GaussianParameters):
-    """Gaussians as they are trained. ReferenceNames has further names of the reference.
+    """The Gaussians of a training. ReferenceNames has further names of the reference.
 
     GaussianParameters has the tensors and their activated forms. optimizer_type: "default" or "sparse_adam", whose step
     takes a mask of the visible Gaussians. spatial_lr_scale: extent of the scene, world units. percent_dense: largest
@@ -132,7 +132,7 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         self.exposures.training_setup(training_args)
 
     def step_sparsely(self) -> None:
-        """Step only what a view sees from now on, with the averages that there are. Other code's optimiser stays."""
+        """Step only Gaussians that a view sees from now on, with the same averages. Other code's optimiser stays."""
         old = self.optimizer
         if type(old) is GaussianAdam:
             groups = ({key: group[key] for key in ("params", "lr", "name")} for group in old.param_groups)
@@ -151,9 +151,9 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         return rate
 
     def scale_rates(self, factor: float, bands: float = 1.0) -> None:
-        """Set the learning rates that `training_setup` has made to a multiple, but that of the positions.
+        """Multiply the learning rates that `training_setup` has made, except the positions'.
 
-        bands: further factor of that of SH bands above degree 0.
+        bands: further factor for SH bands above degree 0.
         """
         for group in self.optimizer.param_groups:
             if group.get("name") in self._rates and group["name"] != "xyz":
@@ -178,7 +178,7 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         self.exposures.step()
 
     def drop_gradients(self) -> None:
-        """Take no step by the gradients that there are."""
+        """Drop the gradients without a step."""
         self.optimizer.zero_grad(set_to_none=True)
         self.exposures.optimizer.zero_grad(set_to_none=True)
 
@@ -197,7 +197,7 @@ class GaussianModel(ReferenceNames, GaussianParameters):
         self.exposures.optimizer.rewind(steps)
 
     def drop_held_steps(self, steps: int) -> None:
-        """Forget the steps that a guard held back: so many in all values, and one in those that it has marked."""
+        """Undo the counts of steps that a guard held back: `steps` in all values, and one in the marked values."""
         self.rewind(steps)
         self.optimizer.drop_marks()
         self.exposures.optimizer.drop_marks()

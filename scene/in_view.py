@@ -1,4 +1,4 @@
-"""The points that a view sees, and their share."""
+"""Visibility of points in views."""
 
 import math
 from collections.abc import Sequence

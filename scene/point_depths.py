@@ -1,4 +1,4 @@
-"""Inverse depth at places of a view, from points: as supervision (Deng et al. 2022, DS-NeRF, section 3), and as scores.
+"""Inverse depth at pixels of a view, from points: as supervision (Deng et al. 2022, DS-NeRF, section 3), and as scores.
 
 Points of structure from motion that are never trained on score the depth of test views.
 """
@@ -57,7 +57,7 @@ def held_out_points(scene: Scene, source_path: str) -> dict[str, PointDepths]:
 def points_of(
     camera: View, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False, enlargement: float = 1.0
 ) -> PointDepths | None:
-    """What a track says of a view's depth, with weights of that sum; of points in one pixel, that of most weight.
+    """Make the depths of a track's points in a view, with weights of sum `weight`; one point a pixel, the heaviest.
 
     view: has the dataset's pose and lens, so that a resumed training, where they may have moved, has the same points.
     held_out: those that are never trained on, in place of the others. enlargement: of the model where it is drawn.

@@ -23,11 +23,12 @@ def motion(twist: Tensor) -> Tensor:
 
 
 def moved(camera: AnyCamera, twist: Tensor, frame: Frame = "camera") -> AnyCamera:
-    """A copy of a Camera or MiniCam whose matrices and centre follow a twist (6,) and pass gradients to it.
+    """Copy a Camera or MiniCam; matrices and centre of the copy follow a twist (6,) and pass gradients to it.
 
-    frame: whose axes and origin the twist has. The view's points move by motion(twist) in the camera's frame, or all
-    points of the world do in the world's. A twist of zeros gives the same matrices. What else describes the pose, such
-    as R and T, is not changed.
+    A twist of zeros gives the same matrices. R and T do not change.
+
+    frame: the frame of the twist. "camera": the view's points move by motion(twist) in the camera's frame; "world": all
+    points move in the world's frame.
     """
     old = camera.world_view_transform
     view, full, center = (values.double() for values in (old, camera.full_proj_transform, camera.camera_center))
@@ -43,7 +44,7 @@ def moved(camera: AnyCamera, twist: Tensor, frame: Frame = "camera") -> AnyCamer
 
 
 def _inverse(view: Tensor) -> Tensor:
-    """Of an affine map (4, 4). By cross products: a GPU would load a library of solvers for it."""
+    """Invert an affine map (4, 4) by cross products: a GPU would load a library of solvers for torch's inverse."""
     rows = view[:3, :3]
     dual = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0))
     inverse = torch.eye(4, dtype=view.dtype, device=view.device)

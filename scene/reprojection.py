@@ -1,4 +1,4 @@
-"""Poses by the tracks of structure from motion: the reprojection error of points that stay where they are."""
+"""Poses from the tracks of structure from motion: reprojection errors of fixed points."""
 
 import math
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Pull(NamedTuple):
 
 
 def moved_pose(pose: np.ndarray, twist: np.ndarray, unit: float) -> np.ndarray:
-    """A world-to-camera matrix (4, 4) after a twist (6,) in the camera's frame, whose translation counts units.
+    """Move a world-to-camera matrix (4, 4) by a twist (6,) in the camera's frame, whose translation counts in `unit`.
 
     By the closed form of `motion` (scene/poses.py) in Murray, Li and Sastry 1994, eq. 2.14 and 2.36, in Python's
     numbers: a call for each step of a training must be quick.
@@ -81,7 +81,11 @@ def twist_gradient(pose: np.ndarray, numbers: np.ndarray, unit: float) -> np.nda
 
 
 def pull(pose: np.ndarray, track: Track, focal: float, unit: float) -> Pull:
-    """What the reprojection error of a track says of a pose, by `moved_pose`'s twist at 0. focal: pixels."""
+    """Reprojection error of a track in a pose, with derivatives by `moved_pose`'s twist at 0.
+
+    pose: world-to-camera matrix (4, 4).
+    focal: focal length, pixels.
+    unit: length of the twist's unit of translation, in world units."""
     local = np.einsum("ij,kj->ik", pose[:3, :3], track.points) + pose[:3, 3:]
     rays, rows, seen = (_angular if track.angular else _straight)(local, unit)
     shown = focal * seen
@@ -94,7 +98,7 @@ def pull(pose: np.ndarray, track: Track, focal: float, unit: float) -> Pull:
 
 
 def _straight(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays (2, K), x / z and y / z, of a view's points (3, K), their slopes (2, 6, K) by a twist, and who counts."""
+    """Rays (2, K), x / z and y / z, of a view's points (3, K), derivatives (2, 6, K) by a twist, and which count."""
     x, y, z = local
     inverse = 1 / np.maximum(z, _NEAR * unit)
     u, v, zero, near = x * inverse, y * inverse, np.zeros_like(x), unit * inverse
@@ -125,10 +129,10 @@ def damped(curvature: np.ndarray) -> np.ndarray:
 
 
 def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: float, bound: float) -> np.ndarray:
-    """The pose of least reprojection error near a pose, which stays without a track, or where noise explains the gain.
+    """Find the pose of least reprojection error near a pose.
 
-    The F statistic of a pose's six numbers tells that (Seber and Lee 2003, section 4.2). bound: of rotation (radians)
-    and translation (units), beyond which it stays, too.
+    The pose stays as it is without a track, if noise explains the gain by the F statistic of its six numbers (Seber and
+    Lee 2003, section 4.2), or if rotation (radians) or translation (units) exceed `bound`.
     """
     if track is None:
         return pose

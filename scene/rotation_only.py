@@ -1,4 +1,4 @@
-"""Photos from a camera that turns without moving, which tell no depth.
+"""Detection of a camera that turns without moving, so that photos show no depth.
 
 Structure from motion with an unknown focal length makes cameras on a circle of them, which agree with all matches. What
 tells: rotations alone explain the matches of every pair, with one factor of the focal lengths for all.

@@ -15,9 +15,9 @@ import numpy as np
 from groundwork.files.json_files import ENLARGEMENT, OFFSET, read_model_json
 from groundwork.host.machine import compute_device
 from groundwork.ranks.ranks import ALONE, Ranks
-from scene.camera_forms import call_of_either_form
-from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos, replaced
-from scene.dataset_readers import read_scene, replaced_reader, scene_by
+from scene.camera_forms import call_either_form
+from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos, find_replacement
+from scene.dataset_readers import find_reader_replacement, read_scene, read_scene_by
 from scene.images.masks import MaskOptions, check_masks
 from scene.images.store import ImageStore, Picture, image_device
 from scene.readers.info import CameraInfo, SceneInfo, photo_size
@@ -112,8 +112,8 @@ class Scene:
         if fresh:
             _refuse_dataset_folder(args)
         kind = kind_of(args.source_path)
-        if read := replaced_reader(kind):
-            info = scene_by(read, kind, args)
+        if read := find_reader_replacement(kind):
+            info = read_scene_by(read, kind, args)
         else:
             masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
             info = read_scene(
@@ -172,7 +172,7 @@ class Scene:
     def create_gaussians(self) -> None:
         """Start from the dataset's points."""
         cloud, views, extent = self.info.point_cloud, self.info.train_cameras, self.cameras_extent
-        call_of_either_form(self.gaussians.create_from_pcd, (cloud, views, extent), (cloud, extent))
+        call_either_form(self.gaussians.create_from_pcd, (cloud, views, extent), (cloud, extent))
 
     def write_inputs(self) -> None:
         """Write the cloud and the cameras into the model folder, `input.ply` and `cameras.json`."""
@@ -183,7 +183,7 @@ class Scene:
         else:
             colors = np.round(info.point_cloud.colors * 255).astype(np.uint8)
             write_point_cloud(folder / "input.ply", info.point_cloud.points, colors)
-        entry = replaced("camera_to_JSON") or camera_to_JSON
+        entry = find_replacement("camera_to_JSON") or camera_to_JSON
         entries = [entry(i, camera) for i, camera in enumerate([*info.test_cameras, *info.train_cameras])]
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
@@ -192,7 +192,7 @@ class Scene:
         self, args: argparse.Namespace, scale: float, shuffle: bool, views: Sequence[CameraInfo], test: bool
     ) -> list[Camera]:
         """Cameras of views, which are held out (test) or train, in the same order at every scale."""
-        cameras_of = replaced("cameraList_from_camInfos") or cameraList_from_camInfos
+        cameras_of = find_replacement("cameraList_from_camInfos") or cameraList_from_camInfos
         cameras = list(cameras_of(views, scale, args, self.info.is_nerf_synthetic, test))
         ours = [(camera, view) for camera, view in zip(cameras, views, strict=False) if isinstance(camera, Camera)]
         for camera, _ in ours:

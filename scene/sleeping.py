@@ -1,9 +1,9 @@
-"""Blocks of Gaussians that sleep: a step costs what its view may see, and Adam stays dense.
+"""Blocks of Gaussians that sleep: a step costs only the Gaussians that its view may show, and Adam stays dense.
 
-A row without a gradient goes on by Adam's averages alone, and its steps have a closed form (csrc/math/sleep.h of the
-rasterizer). So a block of 128 rows that a view certainly does not show is left alone, and takes all the steps that it
-has missed when a view may show it. Rows lie along a Morton curve, so most blocks are small in space. Every REST
-iterations all blocks wake, so that what is saved then is whole.
+Steps of a row without gradient depend on Adam's averages alone, and have a closed form (csrc/math/sleep.h of the
+rasterizer). So a block of 128 rows that a view certainly does not show is skipped, and takes all missed steps when a
+view may show it. Rows lie along a Morton curve, so most blocks are small in space. Every REST iterations all blocks
+wake, so that saved files are complete.
 """
 
 from collections.abc import Iterator
@@ -31,7 +31,7 @@ State = dict[str, Any]  # awake, taken and terms, and of the rows that sleep all
 
 
 class Sleeping:
-    """Which blocks of a model are awake, and the steps that the others miss."""
+    """The sleeping blocks of a model, and the steps that they have missed."""
 
     def __init__(self, gaussians: GaussianModel) -> None:
         self._gaussians, self._adam = gaussians, FusedAdam(gaussians)
@@ -42,7 +42,7 @@ class Sleeping:
         self.reset()
 
     def reset(self) -> None:
-        """All blocks are awake and have missed nothing: call it once all rows have taken the same steps."""
+        """Mark all blocks awake, without missed steps. Call this once all rows have taken the same steps."""
         rows = self._gaussians._xyz
         blocks = -(-len(rows) // BLOCK)
         taken = int(self._gaussians.optimizer.state_of(rows)["step"])
@@ -54,24 +54,24 @@ class Sleeping:
         self._is_whole = True
 
     def wake(self, scene: Scene, now: Tensor | None = None) -> Tensor:
-        """Before a step: wake the blocks that the scene's camera may show. now: of FusedAdam.write_now.
+        """Wake the blocks that the scene's camera may show, before a step. now: from FusedAdam.write_now.
 
-        Returns which are awake, as the rasterizer takes it: on a GPU their list, from which it draws at the cost of
-        these alone; else, and of a rank's rows, a flag for each.
+        Returns the blocks that are awake for the rasterizer: on a GPU their list, so that only these cost time; on a
+        CPU, and with several ranks, a flag for each block.
         """
         blocks = self._wake(scene, False, now)
         return self.awake if blocks is None or self._gaussians.shards.ranks.several else blocks
 
     def stepped(self) -> None:
-        """A step was taken, or taken back: from now on, the blocks that sleep are behind."""
+        """Note that a step was taken, or taken back: blocks that sleep have then missed steps."""
         self._is_whole = False
 
     def flushes(self, iteration: int) -> bool:
-        """Whether all blocks wake after a step."""
+        """Tell whether all blocks wake after the step of an iteration."""
         return iteration % REST == 0
 
     def flush(self) -> None:
-        """Let all blocks take the steps that they have missed. The next step may leave them asleep."""
+        """Let all blocks take the steps that they have missed. They may sleep in the next step again."""
         if self._asleep is not None:
             self._put_back(self._asleep)
             self._asleep = None
@@ -79,12 +79,12 @@ class Sleeping:
         self._is_whole = True
 
     def rows(self) -> Tensor:
-        """The rows that are awake, (N,) bool."""
+        """Mark the rows that are awake, (N,) bool."""
         return self.awake.bool().repeat_interleave(BLOCK)[: len(self._gaussians._xyz)]
 
     @contextmanager
     def flushed_view(self) -> Iterator[None]:
-        """Within it, the model is what it would be had no block slept; then it is as before, to the bit."""
+        """Let no block have slept while the context lasts; afterwards restore the model to the bit."""
         if self._is_whole:
             yield
             return
@@ -99,15 +99,15 @@ class Sleeping:
                 self._asleep = None
 
     def captured(self) -> State | None:
-        """Within `flushed_view`, what a checkpoint of the model lacks; None: nothing. Every rank must call it."""
+        """The state of sleep that a checkpoint within `flushed_view` lacks; None: nothing. Every rank must call it."""
         if self._asleep is None:
             return None
-        whole = self._gaussians.shards.whole
+        whole = self._gaussians.shards.gather_whole
         changed = {name: whole(self._asleep[name]) for name in ("awake", "taken")}
         return self._asleep | changed | {"rows": [whole(values) for values in self._asleep["rows"]]}
 
     def restore(self, captured: State) -> None:
-        """Let the blocks sleep again that slept when a checkpoint was written. UserError if it does not fit."""
+        """Restore the sleep of blocks from `captured`. UserError if it does not fit the model."""
         shards, count = self._gaussians.shards, len(self._gaussians)
         first = shards.first // BLOCK
         try:
@@ -139,7 +139,7 @@ class Sleeping:
         self._is_whole = False
 
     def _copied(self) -> list[Tensor]:
-        """What a step changes of the rows that sleep; on the host where the device has no memory left."""
+        """Copy the values and averages of the sleeping rows; to the host if the device has no memory left."""
         rows, moved = self._sleepers(), self._moved()
         if not any(map(is_spilled, moved)):
             with suppress(torch.OutOfMemoryError):
@@ -153,12 +153,12 @@ class Sleeping:
         return [self._gaussians.raw(name).detach() for name in _NAMES]
 
     def _moved(self) -> list[Tensor]:
-        """All that a step changes."""
+        """All tensors that a step changes."""
         states = [self._gaussians.optimizer.state_of(self._gaussians.raw(name)) for name in _NAMES]
         return [*self._values(), *(state[name] for state in states for name in ("exp_avg", "exp_avg_sq"))]
 
     def _anywhere(self) -> Scene:
-        """The Gaussians with a camera, of which nothing matters."""
+        """The rasterizer's arguments to wake all blocks: the Gaussians with an arbitrary camera, which is not read."""
         means, opacities, scales, rotations, sh_dc, sh_rest = self._values()
         matrix, center = torch.eye(4, device=means.device), means.new_zeros(3)
         shapes = means, opacities, scales, rotations, None, None

@@ -1,8 +1,8 @@
-"""Photos that a model lays upon each other although they show different things, as matches of parts that look alike do.
+"""Detection of photos that a model puts in one place although they show different things that look alike.
 
-Two rooms with one poster, or a box whose front and back are alike: all matches agree with the model, also those between
-the parts. What is missing tells: a photo from nearly the same place should match the other nearly everywhere, and
-matches it on the poster alone.
+In two rooms with the same poster, or with a box whose front and back are alike, all matches agree with the model, also
+those between the parts. But matches are missing: a photo from nearly the same place should match the other nearly
+everywhere, and matches it only on the poster.
 """
 
 import contextlib

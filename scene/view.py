@@ -16,7 +16,7 @@ from torch import Tensor
 from groundwork.host.machine import compute_device
 from scene.images.masks import TRANSPARENT, Cutout, Opaque
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
-from scene.images.store import ImageStore, InMemory, Picture, Size, Source, at_hand, image_device
+from scene.images.store import ImageStore, InMemory, Picture, Size, Source, has_pixels, image_device
 from scene.readers.depth_maps import depth_fit
 from scene.readers.info import CameraInfo
 from utils.graphics_utils import camera_center, fov2focal, projection, world_to_camera
@@ -48,7 +48,7 @@ class View:
     def __init__(
         self, info: CameraInfo, size: Size, uid: int, columns: slice | None = None, data_device: str = "cuda"
     ) -> None:
-        """The view of a record at a size (width, height). data_device: where photos in memory lie."""
+        """Make the view of a record at a size (width, height). data_device: device of photos in memory."""
         self.uid, self.colmap_id = uid, info.uid
         self.FoVx, self.FoVy = info.FovX, info.FovY
         self.image_name = info.image_name
@@ -82,7 +82,7 @@ class View:
         return InMemory(source.pixels.to(self._photo_device)) if isinstance(source, InMemory) else source
 
     def place(self, R: np.ndarray, T: np.ndarray) -> None:
-        """Give it another pose: R, T, and the matrices and centre that follow from them."""
+        """Give the view another pose: R, T, and the matrices and centre that follow from them."""
         self.R, self.T = R, T
         self._pose = np.array(R), np.array(T)  # R and T may be changed in place
         for name in _OF_POSE:
@@ -92,8 +92,8 @@ class View:
     def numbers(self) -> np.ndarray:
         """Elements (51,) float32 of world_view_transform, full_proj_transform, camera_center and projection_matrix.
 
-        They are those of `place`, whatever was assigned, on the host. Computed in float64, so that they are rounded
-        only once.
+        The elements follow from the pose of `place`, whatever was assigned, on the host. They are computed in float64,
+        so that they are rounded only once.
         """
         view, project = world_to_camera(*self._pose), self._projection
         center = camera_center(self._pose[0], view[:3, 3])
@@ -122,10 +122,10 @@ class View:
         return self._tensor[35:].view(4, 4)
 
     def at_size(self, size: tuple[int, int]) -> "View":
-        """This view at a smaller size (width, height), with pictures that are area averages of its own.
+        """Copy this view at a smaller size (width, height), with area averages of its pictures.
 
-        They are decoded and computed now, and lie in the copy on `device`; of an image that processes share, one of
-        them does so later (SharedImage). Columns that count in it cover no other.
+        Pictures are decoded and averaged now, on `device`; an image that processes share is averaged later, by one of
+        them (SharedImage). A column of the copy counts if it covers only columns that count.
         """
         twin, (old, _) = copy.copy(self), self._size
         twin.image_width, twin.image_height = twin._size = size
@@ -149,9 +149,9 @@ class View:
         def on_device(pixels: Tensor) -> Tensor:
             return change(pixels.to(self.device, non_blocking=True))
 
-        if source is None or at_hand(source):
-            return source and source.changed(on_device)
-        return self.images.changed(source, self._size, on_device)
+        if source is None or has_pixels(source):
+            return source and source.transformed(on_device)
+        return self.images.transformed(source, self._size, on_device)
 
     @property
     def images(self) -> ImageStore:
@@ -171,10 +171,10 @@ class View:
         Empty if they were given as pixels.
         """
         sources = (self._source, self._mask, self._depth, *self.pictures.values())
-        return [(s, self._size) for s in sources if s is not None and not at_hand(s)]
+        return [(s, self._size) for s in sources if s is not None and not has_pixels(s)]
 
     def _stored(self, source: Source | InMemory) -> Tensor:
-        return source.pixels if at_hand(source) else self.images.get(source, self._size)
+        return source.pixels if has_pixels(source) else self.images.get(source, self._size)
 
     def _decoded(self, source: Source | InMemory) -> Tensor:
         return self._stored(source).to(self.device, non_blocking=True)
@@ -207,7 +207,7 @@ class View:
 
     @property
     def counts_all_pixels(self) -> bool:
-        """Whether `counted_pixels` is None for a reason that is known without the photo."""
+        """True if `counted_pixels` is None for a reason that is known without the photo."""
         return self._mask is None and not self._ignore_alpha
 
     @property
@@ -224,7 +224,7 @@ class View:
 
     @property
     def depth_reliable(self) -> bool:
-        """Whether there is an inverse depth map to train on."""
+        """True if there is an inverse depth map to train on."""
         return self._reliable
 
     @property

@@ -1,7 +1,4 @@
-"""Splats, models and scenes: the splats of a model, and a file's Gaussians as a model, also in a scene's frame.
-
-A file's Gaussians are the start of a training, or other people's models in our views.
-"""
+"""Conversion between models and splats; splats of a file with a scene, as the start of a training or to be shown."""
 
 import argparse
 import copy
@@ -28,7 +25,7 @@ from utils.system_utils import UserError
 
 @torch.no_grad()
 def splats_of(gaussians: GaussianModel, antialiasing: bool = False) -> Splats:
-    """The Gaussians of a model, on the CPU. Other activations than ours are undone, as files hold logits and logs."""
+    """Make splats of a model, on the CPU. Values of other activations become logits and logs, as in files."""
     shapes = gaussians.log_scales(), gaussians.get_rotation, gaussians.opacity_logits()[:, 0]
     values = (gaussians.get_xyz, *shapes, gaussians.get_features)
     means, scales, rotations, logits, sh = (x.detach().float().cpu().contiguous().numpy() for x in values)
@@ -52,7 +49,7 @@ def place(gaussians: GaussianModel, model_path: str | os.PathLike) -> None:
 
 
 def model_of(splats: Splats, sh_degree: int | None = None) -> GaussianModel:
-    """A model, on the device that computes, whose SH bands are all active. sh_degree: of the model, None: the splats'.
+    """Make a model, on the device that computes, with all SH bands active. sh_degree: the model's, None: the splats'.
 
     Bands that the splats lack are zero; those above sh_degree are left out.
     """
@@ -83,11 +80,13 @@ def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
 def scene_with(
     path: str, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
 ) -> tuple[Scene, Splats | None]:
-    """A scene whose points are a file's, and the file's splats in the scene's frame; None for a point cloud.
+    """Make a scene whose points are a file's, and return its splats in the scene's frame, None for a point cloud.
 
-    The model stays empty. options: the model options. Positions in the file are those of the world, unless our comment
-    world_offset tells their origin. of_scene: further arguments of Scene. UserError for a file without splats that are
-    drawn, and as from Scene.
+    The model stays empty. Positions in the file are the world's, unless our comment world_offset has their origin.
+    UserError for a file without splats that are drawn, and as from Scene.
+
+    options: the model options.
+    of_scene: further arguments of Scene.
     """
     options = copy.copy(options)
     if is_point_cloud(path):

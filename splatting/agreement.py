@@ -23,9 +23,9 @@ def agree_on_options(args: argparse.Namespace) -> None:
     """UserError if ranks have other code or options than rank 0."""
     if not ranks().several:
         return
-    refuse_differences(ranks().everyone(_code()), "give all ranks the same files", shown=False)
+    refuse_differences(ranks().all_gather_objects(_code()), "give all ranks the same files", shown=False)
     options = {f"--{name}": str(value) for name, value in vars(args).items()}
-    refuse_differences(ranks().everyone(options), "start all ranks with the same command")
+    refuse_differences(ranks().all_gather_objects(options), "start all ranks with the same command")
 
 
 def agree_on_scene(scene: Scene, start: str | None) -> None:
@@ -35,7 +35,7 @@ def agree_on_scene(scene: Scene, start: str | None) -> None:
     facts = {"the training views": _digest(scene.getTrainCameras()), "the test views": _digest(scene.getTestCameras())}
     if start:
         facts[start] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
-    refuse_differences(ranks().everyone(facts), "give all ranks the same dataset", shown=False)
+    refuse_differences(ranks().all_gather_objects(facts), "give all ranks the same dataset", shown=False)
 
 
 def _code() -> dict[str, str]:
@@ -78,10 +78,10 @@ class StepAgreement(Part):
         self._asked: type[KeyboardInterrupt] | None = None
 
     def begins(self, at: Iteration) -> None:
-        self._group.post(int(at.due), _SIGNALS.index(self._interrupt.requested))
+        self._group.piggyback(int(at.due), _SIGNALS.index(self._interrupt.requested))
 
     def measured(self, at: Iteration, losses: Losses) -> None:
-        due, signal = self._group.heard()
+        due, signal = self._group.latest()
         at.due = bool(due)
         self._asked = _SIGNALS[signal]
 
@@ -92,4 +92,4 @@ class StepAgreement(Part):
 
     def wait(self) -> None:
         """Wait until the first has written what it writes: torchrun ends all once one has ended."""
-        self._group.anyone(False)
+        self._group.any_rank(False)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from groundwork.finding import Finding, Severity
 from groundwork.host.listing import some
-from scene.checks.conversion import already_undistorted
+from scene.checks.conversion import has_undistorted_photos
 from scene.gaussians import density_rules as rules
 from splatting.records.error_curve import Row, gain_since_peak, peak
 from splatting.registry import part_class, strategies, tools
@@ -34,7 +34,7 @@ def check_alone(projection: str, several: bool) -> None:
 
 def check_native(options: argparse.Namespace) -> None:
     """Say where --lenses native, as it was given, comes too late."""
-    if getattr(options, "lenses", "") == "native" and already_undistorted(options.source_path):
+    if getattr(options, "lenses", "") == "native" and has_undistorted_photos(options.source_path):
         print(
             "warning: --lenses native has no effect, since convert.py undistorted the photos of this scene; to train "
             "on them as they were taken, convert again with --lenses native",

@@ -35,10 +35,10 @@ _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
 def new_folder(scene: str = "") -> str:
     """Name of a folder under ./output: OAR_JOB_ID as in the reference, else a new one after the folder of the scene."""
     if job := os.environ.get("OAR_JOB_ID"):
-        return os.path.join("./output/", ranks().shared(job)[:10])
+        return os.path.join("./output/", ranks().broadcast_object(job)[:10])
     name = os.path.join("./output/", os.path.basename(os.path.realpath(scene)) or "model")
     names = (f"{name}_{number}" if number > 1 else name for number in count(1))
-    return ranks().shared(next(new for new in names if not os.path.exists(new)))
+    return ranks().broadcast_object(next(new for new in names if not os.path.exists(new)))
 
 
 def folder_of(checkpoint: str | None) -> str | None:

@@ -7,8 +7,8 @@ from types import TracebackType
 import torch
 from torch import Tensor
 
-from gaussian_renderer import draw, exposed, in_world_units, render, wake
-from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer import apply_trained_exposure, draw, render, to_world_units, wake
+from gaussian_renderer.memory_errors import explain_memory_errors
 from splatting.agreement import StepAgreement
 from splatting.faster import FasterSteps, faster_steps
 from splatting.iteration import Iteration, Losses
@@ -32,7 +32,7 @@ def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
     package = render(at.camera, gaussians, run.pipe, at.background, **options)
     planes = _planes(package, run)
     if gaussians.exposures.applied:
-        package["render"] = exposed(package["render"], at.camera, gaussians)
+        package["render"] = apply_trained_exposure(package["render"], at.camera, gaussians)
     losses = run.objective(package, at)  # (1 - lambda) L1 + lambda (1 - SSIM), and terms of parts
     losses.total.backward()
     if _is_for_sleepers(run):
@@ -70,7 +70,7 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
     at = None
     try:
         # Backward runs on this thread: waking autograd's worker costs time in every iteration.
-        explained = memory_errors_explained(run.gaussians, run.views.cameras, _REMEDY, "training")
+        explained = explain_memory_errors(run.gaussians, run.views.cameras, _REMEDY, "training")
         with explained, run.interrupt, tell, torch.autograd.set_multithreading_enabled(False):
             try:
                 for at in run.iterations():  # a view in the order of the seed, its background, terms of the loss
@@ -174,7 +174,7 @@ def _planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
 def _step_camera(run: Run, at: Iteration, planes: list[Tensor | None]) -> None:
     color, depth = (None if plane is None else plane.grad for plane in planes)
     drawn = draw(at.camera, run.gaussians, run.pipe, at.background, depth is not None)
-    run.step_camera(at, drawn.camera_gradient(color, in_world_units(depth, run.gaussians)))
+    run.step_camera(at, drawn.camera_gradient(color, to_world_units(depth, run.gaussians)))
 
 
 def _prepare_rows(run: Run, at: Iteration) -> None:

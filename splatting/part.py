@@ -29,8 +29,8 @@ What only one part can give is a slot of the run or of the model, with a neutral
 `begin`, or earlier; a second one that does so is refused by `fill`:
 
 model.exposures what photos make of renders, trained with the Gaussians (scene/gaussians/exposure.py)
-model.pinned which Gaussians density control leaves where they are, and as large as they are
-model.room   where rows lie: on the device, or a part of them on the host (scene/gaussians/spilled.py)
+model.fixed  which Gaussians density control leaves where they are, and as large as they are
+model.storage where rows lie: on the device, or a part of them on the host (scene/gaussians/spilled.py)
 run.schedule which steps of the schedule an iteration stands for
 run.views    the view of an iteration
 run.sizes    the size of a view in an iteration

@@ -44,7 +44,7 @@ def announce_memory(
     max_splats: as for `expected_count`. absolute: with absolute gradients. size: of processes that train together; each
     says what itself needs.
     """
-    images, device, space = scene.images, gaussians.get_xyz.device, gaussians.room
+    images, device, space = scene.images, gaussians.get_xyz.device, gaussians.storage
     pixels = largest_view(scene)
     now = gaussians.gaussian_count
     later = expected_count(max_splats, now)

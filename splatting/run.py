@@ -75,7 +75,9 @@ class Run:
         self.opt, self.pipe, self.launch = opt, pipe, launch
         self.group = ranks()
         check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
-        self.start = self.group.shared(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+        self.start = self.group.broadcast_object(
+            folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations)
+        )
         check_native(dataset)  # before auto becomes native
         dataset = self.dataset = folder.resolve_lenses(dataset, self.start)
         if opt.strategy == "auto" and self.start:
@@ -96,7 +98,7 @@ class Run:
         agree_on_scene(self.scene, self.start)  # before an image is shared
         count = len(capture[1] if capture else self.scene.info.point_cloud.points if first is None else first)
         self.gaussians.divide(self.group)
-        self.gaussians.room.expect(-(-count // self.group.size), self.scene)
+        self.gaussians.storage.reserve(-(-count // self.group.size), self.scene)
         self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
         self.decode_ahead(self.first_iteration + 1)
         self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
@@ -239,7 +241,7 @@ class Run:
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = folder.continue_records(to, start, self.first_iteration)
         self.losses.mean = self.log.loss
-        self.clock = Stopwatch(joules_counter(self.group.everyone(nvml_name(self.device))))
+        self.clock = Stopwatch(joules_counter(self.group.all_gather_objects(nvml_name(self.device))))
         for opened in self.each("opened"):
             opened(self)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from gaussian_renderer import render
-from gaussian_renderer.scored_views import ScoredViews, beside_test, shown_as_trained
+from gaussian_renderer.scored_views import ScoredViews, extra_test_views, has_trained_exposure
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -70,7 +70,8 @@ def training_report(
     tb_writer: a SummaryWriter of TensorBoard, which gets scores, images and every tenth iteration's losses, or None.
     elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
     more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
-    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, `beside_test` included.
+    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, `extra_test_views`
+    included.
     """
     told = [Events(tb_writer, iteration)] if tb_writer else []
     for events in told:
@@ -82,13 +83,13 @@ def training_report(
         options["want_depth"] = False  # our own addition: only images are scored
 
     def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
-        exposed = {"use_trained_exp": True} if shown_as_trained(camera, gaussians) else {}
+        exposed = {"use_trained_exp": True} if has_trained_exposure(camera, gaussians) else {}
         return renderFunc(camera, gaussians, *renderArgs, **options | exposed)["render"]
 
     views = ScoredViews(*renderArgs[:2], train_test_exp, draw)
     train, test = scene.getTrainCameras(), scene.getTestCameras()
     sets = {"test": (views, test)}
-    for name, (how, cameras) in beside_test(scene, *renderArgs[:2]).items():
+    for name, (how, cameras) in extra_test_views(scene, *renderArgs[:2]).items():
         if how and how.halves:  # what they compare with
             sets["test_right_halves"] = ScoredViews(*renderArgs[:2], True, draw), cameras
         sets[f"test_{name}"] = how or views, cameras

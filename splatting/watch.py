@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from gaussian_renderer import shown_by
+from gaussian_renderer import visible_mask
 from groundwork.host.listing import some
 from scene.cameras import Camera
 from scene.checks.points import OTHER_FORMS
@@ -60,7 +60,7 @@ class DivergenceWatch(Part):
         self._latest.extend(losses.values())
         self._iteration = iteration
         bad = next((t for t, loss in losses.items() if not math.isfinite(loss)), _NEVER)
-        bad, stopped = self._run.group.numbers(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
+        bad, stopped = self._run.group.all_gather_host_ints(bad, self._guard.stopped_in() or _NEVER).amin(0).tolist()
         first = min(bad, stopped)
         if first == _NEVER:
             return
@@ -100,7 +100,7 @@ def check_drawn(run: "Run") -> None:
     """Refuse a start that no view shows (UserError), as no step would change anything. Every rank calls it."""
     views = run.scene.getTrainCameras()
     for view in views:
-        if run.group.numbers(int(shown_by(view, run.gaussians, run.pipe).any())).any():
+        if run.group.all_gather_host_ints(int(visible_mask(view, run.gaussians, run.pipe).any())).any():
             return
     raise UserError(f"none of the {len(views)} training views shows any Gaussian of the start; {OTHER_FORMS}")
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gaussian_renderer.camera_paths.poses import facing
+from gaussian_renderer.camera_paths.poses import look_along
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from scene.splats.splats import Splats
@@ -46,7 +46,7 @@ def cameras(count: int = 8, rolls: tuple[float, ...] = (12.0,)) -> list[MiniCam]
         angle = 2 * math.pi * number / count
         offset = 3.5 * (math.cos(angle) * across[0] + math.sin(angle) * across[1]) + 1.2 * UP
         roll = rolls[number] if number < len(rolls) else 0.0
-        turn = facing(-offset, UP) @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
+        turn = look_along(-offset, UP) @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
         wxyz = Rotation.from_matrix(turn).as_quat(scalar_first=True).tolist()
         camera = free_view(*SIZE, math.radians(FOV), (CENTRE + offset).tolist(), wxyz, "cpu")
         camera.image_name = f"photo_{number}.jpg"

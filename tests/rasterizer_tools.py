@@ -18,7 +18,7 @@ from diff_gaussian_rasterization import ops as functions
 from diff_gaussian_rasterization.backend import OPERATORS as ops
 from torch import Tensor
 
-from tests.workloads.splat_scenes import on_device, settings
+from tests.workloads.splat_scenes import move_camera, settings
 
 GPU_MARKS = (
     pytest.mark.gpu,
@@ -112,7 +112,7 @@ def gradients(
     """
     inputs = leaves({name: t.to(device) for name, t in parameters.items()})
     means2d = torch.zeros_like(inputs["means"]).requires_grad_()
-    out = render(inputs, on_device(camera, device), means2d, **options)
+    out = render(inputs, move_camera(camera, device), means2d, **options)
     (loss or loss_of)(out).backward()
     named = {f"d {name}": t.grad for name, t in [*inputs.items(), ("means2d", means2d)]}
     return {name: t.detach().cpu() for name, t in (out._asdict() | named).items()}
@@ -306,7 +306,7 @@ def borderline_splats(n: int, width: int, height: int, dtype: torch.dtype, devic
     }
     parameters["scales"][: n // 2] = parameters["scales"][: n // 2, :1]
     parameters = {name: t.to(device, dtype) for name, t in parameters.items()}
-    camera = on_device(settings(width, height, dtype), device)
+    camera = move_camera(settings(width, height, dtype), device)
     splats, depths, _, counts, _ = ops.project(*scene_arguments(parameters, camera, raw=False))
     # The corner of a tile, not far from the mean: where a tile's least distance is at a pixel centre.
     u, v = (2 * torch.randn(2, n, generator=g)).clamp(-2.5, 2.5).to(device)

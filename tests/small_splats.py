@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from applications.export.formats import format_of
+from applications.export.formats import find_format
 from scene.splats.splats import Splats, tidy
 
 COUNT, FAR = 2000, 7  # splats of `cube`, and the number of the one that lies apart
@@ -21,7 +21,7 @@ def written(folder: Path, ending: str, some: Splats, name: str = "model") -> Pat
     if ending in _PACKAGES:
         pytest.importorskip(_PACKAGES[ending], reason="the extra [export] is not installed")
     path = folder / (name + ending)
-    format_of(path).write(path, some)
+    find_format(path).write(path, some)
     return path
 
 

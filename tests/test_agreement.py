@@ -12,7 +12,7 @@ from photo_room import cam_to_world, camera_centers
 from scipy.optimize import minimize
 
 from applications.convert import mapping
-from applications.convert.findings import is_wrong
+from applications.convert.checks import is_wrong
 from scene import agreement
 from scene.checks.fit import check_agreement
 from utils.system_utils import UserError
@@ -219,13 +219,13 @@ def test_a_small_model_beside_a_folded_one_is_not_trusted():
     folded = {"photos": 24, "pairs": 99, "agreeing": 14, "contradicting": 0.04, "alike": ["1", "2"]}
     small = folded | {"photos": 14, "alike": []}
     large = folded | {"photos": 22, "agreeing": 22, "alike": []}
-    assert max([folded, small], key=partial(mapping._rank, [folded, small])) is folded
-    assert max([folded, large], key=partial(mapping._rank, [folded, large])) is large
+    assert max([folded, small], key=partial(mapping._rank_key, [folded, small])) is folded
+    assert max([folded, large], key=partial(mapping._rank_key, [folded, large])) is large
 
 
 def test_when_a_model_is_called_wrong():
     right = {"pairs": 90, "contradicting": 0.05, "agreeing": 40, "photos": 42, "bound": 42}
-    assert mapping.agrees(right) and not is_wrong(right)
-    assert not mapping.agrees(right | {"agreeing": 30}) and not is_wrong(right | {"agreeing": 30})
+    assert mapping.is_accepted(right) and not is_wrong(right)
+    assert not mapping.is_accepted(right | {"agreeing": 30}) and not is_wrong(right | {"agreeing": 30})
     assert is_wrong(right | {"agreeing": 20}) and is_wrong(right | {"contradicting": 0.3})
-    assert not is_wrong({"pairs": 0}) and not mapping.agrees({})  # nothing to judge by
+    assert not is_wrong({"pairs": 0}) and not mapping.is_accepted({})  # nothing to judge by

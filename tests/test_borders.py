@@ -10,7 +10,7 @@ import math
 import pytest
 import torch
 from diff_gaussian_rasterization import GaussianRasterizationSettings, reference
-from rasterizer_tools import BOTH_AND_GPU, Evaluated, errors_above, evaluate, on_device, ops, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, Evaluated, errors_above, evaluate, move_camera, ops, scene_arguments
 from torch import Tensor
 
 from tests.workloads.splat_scenes import settings
@@ -80,7 +80,7 @@ def test_means_on_borders_agree_with_the_oracle(device, dtype, kind, size, proje
     for turn in range(len(_places(size[1]))):
         parameters, at, wanted = _oracle(kind, size, turn, projection)
         rows = {name: t.to(device, dtype) for name, t in parameters.items()}
-        splats, _, _, counts, _ = (t.cpu() for t in ops.project(*scene_arguments(rows, on_device(view, device))))
+        splats, _, _, counts, _ = (t.cpu() for t in ops.project(*scene_arguments(rows, move_camera(view, device))))
         listed = counts > 0
         assert torch.equal(splats[listed, :2].double(), at[listed])
         assert wanted.keep.double().mean() > 0.99

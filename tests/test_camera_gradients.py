@@ -10,7 +10,7 @@ from diff_gaussian_rasterization.gaussians import Gaussians
 from diff_gaussian_rasterization.lens import Lens
 from diff_gaussian_rasterization.scene import draw, scene_arguments
 from gaussians import model, pipeline
-from rasterizer_tools import BOTH_AND_GPU, error, few, loss_of, on_device, render, rigid
+from rasterizer_tools import BOTH_AND_GPU, error, few, loss_of, move_camera, render, rigid
 from torch import Tensor
 
 from gaussian_renderer import render as render_model
@@ -136,7 +136,7 @@ def test_the_total_of_a_pose_is_the_oracles(antialiasing, device, dtype):
     camera = settings(**size, view=VIEW, antialiasing=antialiasing)
     wanted = _pose_gradients(parameters, camera, reference.render)
     moved_to = {name: t.to(device, dtype) for name, t in parameters.items()}
-    camera = on_device(settings(**(size | {"dtype": dtype}), view=VIEW, antialiasing=antialiasing), device)
+    camera = move_camera(settings(**(size | {"dtype": dtype}), view=VIEW, antialiasing=antialiasing), device)
     got = _pose_gradients(moved_to, camera, render.__kwdefaults__["function"])
     for one, two in zip(got, wanted, strict=True):
         # float32: some 1e-7 for each of 40 blends, where pixels' gradients of both signs nearly cancel.
@@ -158,7 +158,7 @@ def _two_ways(parameters: dict[str, Tensor], camera, **asked) -> list[dict[str, 
 def test_other_gradients_keep_their_bytes(device, dtype):
     parameters, size = few(dtype=dtype)
     parameters = {name: t.to(device) for name, t in parameters.items()}
-    camera = on_device(settings(**size, view=VIEW), device)
+    camera = move_camera(settings(**size, view=VIEW), device)
     view = camera.viewmatrix.clone().requires_grad_()
     plain, asked = _two_ways(parameters, camera, viewmatrix=view)
     assert view.grad.isfinite().all() and view.grad[:, :3].all() and not view.grad[:, 3].any()

@@ -22,7 +22,7 @@ from gaussian_renderer.camera_paths.keyframes import (
     frame_moment,
     read_camera_path,
 )
-from gaussian_renderer.camera_paths.poses import Poses, facing, focus_point, ray_through
+from gaussian_renderer.camera_paths.poses import Poses, focus_point, look_along, ray_through
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from scene.cameras import Camera
 from scene.readers.info import CameraInfo
@@ -39,7 +39,7 @@ def about_y(*degrees: float) -> Rotation:
 def looking_at(positions: np.ndarray, target: np.ndarray, up: np.ndarray = UP, fov: float = 40.0) -> Poses:
     """Cameras at (N,3) that look at a point (3,), or each at its own (N,3)."""
     targets = np.broadcast_to(target, positions.shape)
-    turns = [facing(to - at, up) for at, to in zip(positions, targets, strict=True)]
+    turns = [look_along(to - at, up) for at, to in zip(positions, targets, strict=True)]
     return Poses(positions, np.array(turns), np.full(len(positions), fov))
 
 

@@ -9,7 +9,7 @@ from diff_gaussian_rasterization.channels import rasterize_channels
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, activated, error, leaves
 from torch import Tensor
 
-from tests.workloads.splat_scenes import SplatScene, needles, on_device, ordinary
+from tests.workloads.splat_scenes import SplatScene, move_camera, needles, ordinary
 
 COUNTS = (1, 2, 3, 4, 5, 8, 11, 32)
 
@@ -46,7 +46,7 @@ def loss_of(image: Tensor) -> Tensor:
 )
 def test_channels_equal_triples(make, channels, projection, device, dtype):
     scene = make(300)
-    camera = on_device(scene.settings(), device)._replace(projection=projection)
+    camera = move_camera(scene.settings(), device)._replace(projection=projection)
     given, features, background = inputs_of(scene, channels, device, dtype)
     found = []
     for draw in (by_triples, None):
@@ -70,7 +70,7 @@ def test_channels_equal_triples(make, channels, projection, device, dtype):
 def test_colours_come_before_features(device):
     """SH, with a depth as the fourth channel, and the transmittance; gradients of the camera's pose, too."""
     scene = ordinary(200)
-    camera = on_device(scene.settings(), device)
+    camera = move_camera(scene.settings(), device)
     given = {k: v.to(device) for k, v in activated(scene.parameters).items()}
     depth = given["means"][:, 2:].clone()
     found = []
@@ -100,7 +100,7 @@ def test_colours_come_before_features(device):
 def test_what_is_not_needed_gets_no_gradient(device):
     """Features alone; and the background, of which the gradient is the sum of what is left."""
     scene = ordinary(100)
-    camera = on_device(scene.settings(), device)
+    camera = move_camera(scene.settings(), device)
     given, features, background = inputs_of(scene, 7, device, torch.float32)
     features.requires_grad_()
     background.requires_grad_()
@@ -116,7 +116,7 @@ def test_what_is_not_needed_gets_no_gradient(device):
 @CPU_AND_GPU
 def test_absolute_gradients_are_those_of_four_channels(device):
     scene = ordinary(200)
-    camera = on_device(scene.settings(), device)
+    camera = move_camera(scene.settings(), device)
     given, features, background = inputs_of(scene, 3, device, torch.float32)
     found = []
     for draw in (rasterize, rasterize_channels):

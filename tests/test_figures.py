@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from applications.evaluation.report import _from_above
+from applications.evaluation.report import _find_cameras
 from splatting.records.error_curve import COLUMNS
 from splatting.records.figures import draw_cameras, draw_curve, draw_curves, draw_sizes
 
@@ -148,7 +148,7 @@ def test_cameras_from_above_are_drawn_once_for_each_split(tmp_path, drawn):
         (tmp_path / model).mkdir()
         (tmp_path / model / "cameras.json").write_text(json.dumps(entries))
         runs.append({"model": model, "split": split, "views": {"train": 3}})
-    splits = _from_above(tmp_path, [*runs, {"model": "gone", "split": None, "views": {"train": None}}])
+    splits = _find_cameras(tmp_path, [*runs, {"model": "gone", "split": None, "views": {"train": None}}])
     assert {name: [len(one) for one in both] for name, both in splits.items()} == {
         "every 8th by name": [2, 3], "--holdout block": [2, 3]}  # fmt: skip
     test, train = splits["--holdout block"]

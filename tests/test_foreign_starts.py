@@ -19,7 +19,7 @@ from small_splats import splats, written
 import export
 import render
 import train
-from applications.export.formats import format_of
+from applications.export.formats import find_format
 from applications.export.reading import read_any
 from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
 from gaussian_renderer.importance import most_needed
@@ -38,7 +38,7 @@ from utils.system_utils import UserError
 
 def _foreign_ply(path: Path, count: int, kind: str) -> Path:
     """A PLY as another program might write it, of splats(count, 1)."""
-    format_of("a.ply").write(path, splats(count, 1))
+    find_format("a.ply").write(path, splats(count, 1))
     data = PlyData.read(path, mmap=False)["vertex"].data
     names = [name for name in data.dtype.names if name not in ("nx", "ny", "nz")]
     if kind == "2DGS":
@@ -62,7 +62,7 @@ def test_what_is_no_3dgs_model_is_refused_by_name(tmp_path):
         read_splats(points)
     assert is_point_cloud(points) and not is_point_cloud(flat)
     packed = tmp_path / "b.compressed.ply"
-    format_of(packed).write(packed, splats(5))
+    find_format(packed).write(packed, splats(5))
     assert not is_point_cloud(packed)
     with pytest.raises(UserError, match=r"is a compressed PLY; unpack it with export.py --ply .*b.compressed.ply"):
         read_ply(packed, 3)
@@ -203,7 +203,7 @@ def test_two_starts_contradict_each_other(one, other):
 
 def test_render_draws_a_file_in_the_views_of_a_scene(tmp_path, colmap_scene, monkeypatch):
     path = tmp_path / "theirs.compressed.ply"
-    format_of(path).write(path, splats(200, 1, antialiasing=True))
+    find_format(path).write(path, splats(200, 1, antialiasing=True))
     out = tmp_path / "out"
     argv = ["render.py", "-s", colmap_scene, "-m", out, "--eval", "--ply", path, "--skip_train"]
     monkeypatch.setattr("sys.argv", [str(word) for word in argv])
@@ -216,7 +216,7 @@ def test_render_draws_a_file_in_the_views_of_a_scene(tmp_path, colmap_scene, mon
 def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     out = tmp_path / "out"
     start = tmp_path / "start.ply"
-    format_of(start).write(start, splats(300, 3))
+    find_format(start).write(start, splats(300, 3))
     _train(colmap_scene, out, "--init_ply", start)
     capsys.readouterr()
     target = tmp_path / "few.ply"

@@ -10,7 +10,7 @@ from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, Scene, draw
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops, scene_arguments
 from torch import Tensor
 
-from tests.workloads.splat_scenes import PARAMETERS, frustum, on_device, settings
+from tests.workloads.splat_scenes import PARAMETERS, frustum, move_camera, settings
 
 WIDTH, HEIGHT = 45, 70  # 3 x 5 tiles, some cut off
 ACROSS, DOWN = 3, 5
@@ -105,7 +105,7 @@ def scene_of(kind: str, device: str, dtype: torch.dtype) -> tuple[dict[str, Tens
         raw["opacities"][[40, 200]] = -2.0
         raw["opacities"][::7] = torch.nan
     camera = settings(WIDTH, HEIGHT, dtype, projection="ray" if kind == "rays" else "ewa")
-    return {name: t.to(device, dtype).contiguous() for name, t in raw.items()}, on_device(camera, device)
+    return {name: t.to(device, dtype).contiguous() for name, t in raw.items()}, move_camera(camera, device)
 
 
 SCENES = pytest.mark.parametrize("kind", ["empty", "one", "behind", "giants", "many", "rays"])

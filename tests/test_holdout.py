@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from synthetic import edit_json, make_blender_scene, make_nerfstudio_scene, read
 from trainings import train_on
 
-from applications.evaluation.results import _split
+from applications.evaluation.results import _split_views
 from scene.readers.holdout import split
 from scene.readers.info import CameraInfo
 from utils.graphics_utils import focal2fov
@@ -124,7 +124,7 @@ def test_a_model_keeps_its_split_and_is_not_resumed_with_another(colmap_scene, t
     held = [view["img_name"] for view in json.loads((out / "cameras.json").read_text())[:2]]
     assert held == [view.image_name for view in read(colmap_scene, True, rule="block").test_cameras]
     assert json.loads((out / "model.json").read_text())["holdout"] == "block"
-    assert _split(out, None, 2) == "--holdout block"
+    assert _split_views(out, None, 2) == "--holdout block"
     said = "chkpnt2.pth was trained with --holdout block, so it has seen photos that --holdout sector holds out; give"
     with pytest.raises(UserError, match=said):
         train_on(colmap_scene, out, *words, "sector", "--start_checkpoint", out / "chkpnt2.pth")

@@ -9,7 +9,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings
 from diff_gaussian_rasterization.lens import Lens
 from lens_scenes import HEIGHT, PANORAMA, WIDTH, distorted, gaussians, lens, view_through
 from lenses import colmap_camera
-from rasterizer_tools import BOTH_AND_GPU, leaves, on_device, ops, render, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, leaves, move_camera, ops, render, scene_arguments
 
 KNOWN = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE",
          "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE")  # fmt: skip
@@ -43,7 +43,7 @@ def turned(camera: GaussianRasterizationSettings, columns: int) -> GaussianRaste
 @BOTH_AND_GPU
 @pytest.mark.parametrize("antialiasing", [False, True])
 def test_a_panorama_has_no_seam(antialiasing, device, dtype):
-    camera = on_device(view_through(PANORAMA, dtype, antialiasing=antialiasing), device)
+    camera = move_camera(view_through(PANORAMA, dtype, antialiasing=antialiasing), device)
     values = gaussians(PANORAMA, camera, 600)
     values["scales"][::7] += 1
     weight = torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
@@ -67,7 +67,7 @@ def test_a_panorama_has_no_seam(antialiasing, device, dtype):
 
 @BOTH_AND_GPU
 def test_gaussians_at_a_panoramas_poles_are_shown_with_finite_gradients(device, dtype):
-    camera = on_device(view_through(PANORAMA, dtype), device)
+    camera = move_camera(view_through(PANORAMA, dtype), device)
     camera = camera._replace(viewmatrix=torch.eye(4, dtype=dtype, device=device))
     values = gaussians(PANORAMA, camera, 60)
     aside = torch.logspace(0, -50, 60, dtype=torch.float64)  # from a radian to nothing that float32 has

@@ -11,7 +11,7 @@ from diff_gaussian_rasterization.scene import GRADIENTS, Drawing, draw
 from rasterizer_tools import GPU_MARKS, error, scene_arguments
 from torch import Tensor
 
-from tests.workloads.splat_scenes import FOV, PARAMETERS, SplatScene, on_device, settings
+from tests.workloads.splat_scenes import FOV, PARAMETERS, SplatScene, move_camera, settings
 
 pytestmark = [*GPU_MARKS]
 OPS = torch.ops.diff_gaussian_rasterization
@@ -55,7 +55,7 @@ class View:
 
     def __init__(self, count: int, width: int, height: int, device: str = "cuda") -> None:
         scene, camera = heap(count, width, height, device=device), settings(width, height, torch.float32)
-        self.size, self.camera = (height, width), on_device(camera, device)
+        self.size, self.camera = (height, width), move_camera(camera, device)
         self.scene = scene_arguments(scene.parameters, self.camera)
         planes = torch.randn(4, height, width, generator=torch.Generator().manual_seed(3)).to(device)
         self.color, self.depth = planes[:3], planes[3:]

@@ -11,8 +11,8 @@ from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from torch import Tensor
 
 from gaussian_renderer.over_ranks import bands
-from gaussian_renderer.over_ranks.band import surroundings, whole_image
-from gaussian_renderer.over_ranks.bands import Bands, KnownBands, find_bands, row_processed, row_widths
+from gaussian_renderer.over_ranks.band import exchange_halo, gather_image
+from gaussian_renderer.over_ranks.bands import Bands, CachedBands, find_bands, processed_by_row, width_changes
 from groundwork.ranks.ranks import Ranks, ranks
 
 # Height, width, and the rows of tiles where bands begin and the last one ends.
@@ -102,10 +102,10 @@ def _shared() -> list[tuple[Tensor, ...]]:
         view.inverse_depth = torch.full_like(image[:1], torch.nan)
         first, end = bands.pixels(here.rank)
         view.color[:, first:end], view.inverse_depth[:, first:end] = image[:, first:end], photo[:1, first:end]
-        color = surroundings(view).color.clone().requires_grad_()
-        loss, l1 = photometric_loss_by_bands(color, photo, 0.2, (first, end), here.added)
+        color = exchange_halo(view).color.clone().requires_grad_()
+        loss, l1 = photometric_loss_by_bands(color, photo, 0.2, (first, end), here.all_reduce_sum)
         (0.7 * loss).backward()
-        whole_image(view)
+        gather_image(view)
         found.append((loss.detach(), l1, color.grad[:, first:end], view.color, view.inverse_depth))
     return found
 
@@ -130,8 +130,8 @@ class _Others(Ranks):
     def __init__(self, rects: list[Tensor], height: int = 97) -> None:
         self._rects, self._height = rects, height
 
-    def table(self, values: Tensor) -> Tensor:
-        others = [row_widths(rects, torch.ones(len(rects)), self._height) for rects in self._rects[1:]]
+    def all_gather(self, values: Tensor) -> Tensor:
+        others = [width_changes(rects, torch.ones(len(rects)), self._height) for rects in self._rects[1:]]
         widths = torch.stack((values[0], *others))
         return torch.stack((widths, values[1] * torch.tensor([[1], [0], [0]])), 1)
 
@@ -142,10 +142,10 @@ def test_of_many_splats_a_sample_gives_the_bands(monkeypatch):
     rects = torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int()
     tile_counts = torch.randint(2, (20_000,), generator=generator)
     rects[tile_counts == 0] = 1 << 30  # undefined
-    whole = row_widths(rects, tile_counts, 1000)
-    assert torch.equal(whole, row_widths(rects[tile_counts > 0], torch.ones(int(tile_counts.sum())), 1000))
+    whole = width_changes(rects, tile_counts, 1000)
+    assert torch.equal(whole, width_changes(rects[tile_counts > 0], torch.ones(int(tile_counts.sum())), 1000))
     monkeypatch.setattr(bands, "_SAMPLE", 4000)
-    part = row_widths(rects, tile_counts, 1000)
+    part = width_changes(rects, tile_counts, 1000)
     assert not torch.equal(part, whole)
     ends = [widths.cumsum(0)[:-1].cumsum(0) / widths.cumsum(0)[:-1].sum() for widths in (whole, part)]
     assert (ends[0] - ends[1]).abs().max() < 0.03
@@ -157,14 +157,14 @@ def test_bands_follow_what_an_earlier_visit_has_processed():
     last = torch.zeros(953, 40, dtype=torch.int32)  # of 60 x 3 tiles, the last ones cut off
     last[70:100, 3] = 40_000  # in three rows of tiles
     last[75, 39] = 100
-    processed = row_processed(last, range(4, 60))
+    processed = processed_by_row(last, range(4, 60))
     assert processed.nonzero().flatten().tolist() == [4, 5, 6] and processed[4:7].tolist() == [40_100, 40_000, 40_000]
-    assert not row_processed(last, range(7, 60)).any() and not row_processed(last, range(6, 6)).any()
+    assert not processed_by_row(last, range(7, 60)).any() and not processed_by_row(last, range(6, 6)).any()
     ranks, counts = _Others([rects] * 3, height=953), torch.ones(1)
     assert find_bands(ranks, rects, counts, 953, 40).borders == [0, 20, 40, 60]
     assert find_bands(ranks, rects, counts, 953, 40, processed).borders == [0, 5, 6, 60]
-    known = KnownBands()
+    known = CachedBands()
     for visit in range(16):
         borders = known.find("a", ranks, rects, counts, 953, 40).borders
-        known.drawn("a", last)
+        known.note_processed("a", last)
         assert borders == ([0, 20, 40, 60] if visit < 8 else [0, 5, 6, 60])

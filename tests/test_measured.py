@@ -39,9 +39,9 @@ def test_points_tell_where_a_scene_stands_in_metres():
     front = scene([[1.0, 0.3, 1.0], [3.0, -0.4, 1.0]])  # along x, and not quite level
     for ground in (GROUND, GROUND[::-1]):  # in any order
         record = measured_record(None, ABOVE, 1 / SCALE, scene(ground), front)
-        found = Similarity.of(record, "here")
+        found = Similarity.read(record, "here")
         assert found.upright and found.metric and not found.place
-        np.testing.assert_allclose(found.points(scene(GROUND)), GROUND - GROUND.mean(0), atol=1e-9)
+        np.testing.assert_allclose(found.transform(scene(GROUND)), GROUND - GROUND.mean(0), atol=1e-9)
     turned = measured_record(None, ABOVE, None, scene(GROUND), front[::-1])  # from the other side
     np.testing.assert_allclose(turned["rotation"][0], -np.array(record["rotation"][0]), atol=1e-9)
     assert turned["scale"] == 1.0 and turned["unit"] == "scene"
@@ -50,7 +50,7 @@ def test_points_tell_where_a_scene_stands_in_metres():
 def test_what_is_not_measured_stays():
     scaled = measured_record(GPS, ABOVE, 2.0)
     origin = -np.array(GPS["translation"]) / GPS["scale"]
-    np.testing.assert_allclose(Similarity.of(scaled, "here").points(origin[None]), 0, atol=1e-9)
+    np.testing.assert_allclose(Similarity.read(scaled, "here").transform(origin[None]), 0, atol=1e-9)
     assert scaled["latitude"] == 1.0 and "gps_photos" not in scaled and scaled["vertical"] == "gravity"
     level = measured_record(GPS, np.array([0, -1.0, 0]), None, np.array([[0, 0, 0], [1, 0.1, 0], [0, 0, 1.0]]))
     assert "latitude" not in level and level["scale"] == 5.0 and level["gps_photos"] == 9
@@ -58,7 +58,7 @@ def test_what_is_not_measured_stays():
     rotation = np.array(level["rotation"])
     assert np.trace(rotation) > 2.98 and rotation[2] == pytest.approx([0, 0, 1])  # turned no more than it must be
     only = measured_record(None, ABOVE, 2.0)
-    assert not Similarity.of(only, "here").upright and only["unit"] == "metre"
+    assert not Similarity.read(only, "here").upright and only["unit"] == "metre"
 
 
 @pytest.mark.parametrize("unit", [1e-6, 1e6])

@@ -14,7 +14,7 @@ from test_house import ROOT, _module, _python, _tree
 
 from applications.evaluation.stages import _remove_stop
 from applications.export.sog import PROGRAM
-from groundwork.files.ours import digest_of, is_ours, write_picture
+from groundwork.files.ours import folder_digest, is_ours, write_picture
 from groundwork.host.programs import find_program
 from utils.system_utils import UserError
 
@@ -27,18 +27,18 @@ WORK = "a reserved name in `distorted`, or in a scene that convert.py has made; 
 MAY = {
     "groundwork.host.programs.find_program": "the one place that looks for programs",
     "groundwork.host.machine._output": FOUND,
-    "applications.doctor.environment._nvidia_gpu": FOUND,
-    "applications.export.sog.fault_of": FOUND,
-    "applications.export.vendor._output": FOUND,  # npm, and what it installs by a record of the repository
+    "applications.doctor.environment._find_nvidia_gpu": FOUND,
+    "applications.export.sog.find_fault": FOUND,
+    "applications.export.vendor._run_command": FOUND,  # npm, and what it installs by a record of the repository
     "gaussian_renderer.camera_paths.video.write_video": FOUND,
     "applications.convert.colmap._output": FOUND,
     "applications.convert.programs._run": FOUND,  # COLMAP, or worker.py
     "applications.convert.video._warn_if_cut": "runs imageio-ffmpeg's ffmpeg, without relative entries of PATH",
-    "applications.convert.video._filters": "the same",
+    "applications.convert.video._sdr_filters": "the same",
     "applications.convert.video.find_streams": "the same",
     "applications.viewer.measure_tab._put": "the scene's orientation, where there was none before the page wrote it",
-    "groundwork.host.machine.facts_asked": SELF,
-    "applications.doctor.advice._trained": SELF,
+    "groundwork.host.machine.facts_from_process": SELF,
+    "applications.doctor.advice._train": SELF,
     "applications.evaluation.child.run_child": SELF,
     "splatting.records.curve_recorder.begin": SELF,
     # Also that of BuildModules, which empties setuptools' build folder of modules.
@@ -46,9 +46,9 @@ MAY = {
     "submodules.common.build_extension.find_compiler": "the same",
     "submodules.common.build_extension.find_nvcc": "the same",
     "submodules.common.build_extension.toolkit_root": "the same",
-    "applications.export.beside._remove": "a folder that is_ours, and that no other JSON file names",
+    "applications.export.side_files._remove_folder": "a folder that is_ours, and that no other JSON file names",
     "applications.convert.video.remove_frames": "a picture that is_ours, below `input`",
-    "applications.export.beside.with_folder": OWN,
+    "applications.export.side_files.write_with_folder": OWN,
     "applications.export.streamed.write_lod_meta": OWN,
     "applications.demo.make_scene.make_scene": OWN,  # and an empty folder
     "applications.nerfbaselines.method._begin": OWN,
@@ -171,7 +171,7 @@ def test_a_folder_is_ours_by_its_files_and_its_owner(tmp_path):
     folder = tmp_path / "made"
     (folder / "deep").mkdir(parents=True)
     (folder / "deep" / "a").write_text("a")
-    named = folder.rename(tmp_path / f"tiles-{digest_of(folder, 'a.json')}")
+    named = folder.rename(tmp_path / f"tiles-{folder_digest(folder, 'a.json')}")
     assert is_ours(named, "a.json") and not is_ours(named, "b.json")
     (named / "deep" / "mine").touch()
     assert not is_ours(named, "a.json")

@@ -23,21 +23,23 @@ def _talk() -> dict[str, object]:
     parts = [torch.full((here.rank + d, 2), 10 * here.rank + d, dtype=torch.int32) for d in range(here.size)]
     bits = [torch.ones(d, dtype=torch.bool) for d in range(here.size)]
     return {
-        "numbers": here.numbers(here.rank, 7).tolist(),
+        "numbers": here.all_gather_host_ints(here.rank, 7).tolist(),
         "agreed": _agreed(here),
-        "shared": [here.shared({"rank": here.rank}, *holder) for holder in ((), (1,))],
+        "shared": [here.broadcast_object({"rank": here.rank}, *holder) for holder in ((), (1,))],
         "handed": _handed(here),
         "parts": [part.tolist() for part in here.exchange(parts)],
         "bits": [part.tolist() for part in here.exchange(bits)],
-        "rows": here.gather(rows).tolist(),
-        "nothing": here.gather(torch.empty(3, 0)).shape,
+        "rows": here.all_gather_rows(rows).tolist(),
+        "nothing": here.all_gather_rows(torch.empty(3, 0)).shape,
         "sent": _listed(here.send(torch.arange(3), [0] * (here.size - 1) + [3])),
         "known": _listed(here.send(torch.full((here.size,), here.rank), [1] * here.size, [1] * here.size)),
-        "known rows": here.gather(rows, [min(r, 2) for r in range(here.size)]).tolist(),
-        "table": here.table(torch.tensor([[here.rank, 0.5]])).tolist(),
-        "added": here.added(torch.tensor([0.1, 0.0, 7.0 * here.rank], dtype=torch.float64) * (here.rank == 1)).tolist(),
-        "before": here.before(here.rank + 1),
-        "anyone": (here.anyone(here.rank == 1), here.anyone(False)),
+        "known rows": here.all_gather_rows(rows, [min(r, 2) for r in range(here.size)]).tolist(),
+        "table": here.all_gather(torch.tensor([[here.rank, 0.5]])).tolist(),
+        "added": here.all_reduce_sum(
+            torch.tensor([0.1, 0.0, 7.0 * here.rank], dtype=torch.float64) * (here.rank == 1)
+        ).tolist(),
+        "before": here.offset_and_total(here.rank + 1),
+        "anyone": (here.any_rank(here.rank == 1), here.any_rank(False)),
     }
 
 
@@ -45,19 +47,22 @@ def _handed(here: Ranks) -> list[list[float]]:
     """Values of rank 1 in two types, of which other ranks know the shape."""
     kept = [torch.tensor([1, 2, 3], dtype=torch.uint8), torch.tensor([0.5, 9.0, 2.5, 9.0])[::2]]
     mine = [values if here.rank == 1 else None for values in kept]
-    return [here.handed(1, x, like.shape, like.dtype, like.device).tolist() for x, like in zip(mine, kept, strict=True)]
+    return [
+        here.broadcast_from(1, x, like.shape, like.dtype, like.device).tolist()
+        for x, like in zip(mine, kept, strict=True)
+    ]
 
 
 def _agreed(here: Ranks) -> list:
     """Numbers by rank, a flag that rank 1 has raised, and what was posted: with the numbers, and without any."""
     here.flag = torch.tensor([5 if here.rank == 1 else 0])
-    here.post(int(here.rank == 1), 2 * here.rank)
-    found = [here.agree(torch.tensor([here.rank, 7])), here.flag.item(), list(here.heard())]
-    here.agree(torch.tensor([0]))  # as a second view of an iteration
-    found.append(list(here.heard()))
+    here.piggyback(int(here.rank == 1), 2 * here.rank)
+    found = [here.all_gather_ints(torch.tensor([here.rank, 7])), here.flag.item(), list(here.latest())]
+    here.all_gather_ints(torch.tensor([0]))  # as a second view of an iteration
+    found.append(list(here.latest()))
     here.flag.fill_(6 + here.rank)
-    here.post(0, 3)
-    return [*found, list(here.heard()), here.flag.item()]
+    here.piggyback(0, 3)
+    return [*found, list(here.latest()), here.flag.item()]
 
 
 def _listed(sent: tuple[torch.Tensor, list[int]]) -> tuple[list, list[int]]:
@@ -89,10 +94,14 @@ def test_ranks_tell_each_other(size):
 def test_a_process_by_itself_is_all_ranks():
     rows = torch.ones(3, 2)
     assert ranks() is ALONE and ALONE.first and not ALONE.several
-    assert ALONE.gather(rows) is rows and ALONE.exchange([rows]) == [rows]
-    assert ALONE.numbers(4, 5).tolist() == [[4, 5]] and ALONE.before(3) == (0, 3)
-    assert ALONE.send(rows, [3]) == (rows, [3]) and ALONE.added(rows) is rows and ALONE.table(rows).shape == (1, 3, 2)
-    assert ALONE.shared(rows) is rows and ALONE.anyone(True) and not ALONE.anyone(False)
+    assert ALONE.all_gather_rows(rows) is rows and ALONE.exchange([rows]) == [rows]
+    assert ALONE.all_gather_host_ints(4, 5).tolist() == [[4, 5]] and ALONE.offset_and_total(3) == (0, 3)
+    assert (
+        ALONE.send(rows, [3]) == (rows, [3])
+        and ALONE.all_reduce_sum(rows) is rows
+        and ALONE.all_gather(rows).shape == (1, 3, 2)
+    )
+    assert ALONE.broadcast_object(rows) is rows and ALONE.any_rank(True) and not ALONE.any_rank(False)
 
 
 _LEAVE = """
@@ -103,7 +112,7 @@ dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
 ranks = SeveralRanks()
 ranks.itself = ranks
 threads = lambda: [name.read_text() for name in Path("/proc/self/task").glob("*/comm")]
-assert ranks.numbers(7).tolist() == [[7]] and any("gloo" in name for name in threads())
+assert ranks.all_gather_host_ints(7).tolist() == [[7]] and any("gloo" in name for name in threads())
 ranks.leave()
 assert not any("gloo" in name for name in threads())
 """

@@ -8,7 +8,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, decisive
 from rasterizer_tools import BOTH_AND_GPU, leaves, one_splat, pick, render, together
 from torch import Tensor
 
-from tests.workloads.splat_scenes import SplatScene, frustum, on_device, settings
+from tests.workloads.splat_scenes import SplatScene, frustum, move_camera, settings
 
 SIZE = (75, 53)
 
@@ -39,7 +39,7 @@ def _blended(parameters: dict[str, Tensor], camera: GaussianRasterizationSetting
 def test_without_the_others_no_bit_changes(antialiasing, device, dtype):
     scene = _crowd()
     parameters = {name: t.to(device, dtype) for name, t in scene.parameters.items()}
-    camera = on_device(settings(*SIZE, dtype, antialiasing=antialiasing), device)
+    camera = move_camera(settings(*SIZE, dtype, antialiasing=antialiasing), device)
     mask = _decisive(parameters, camera)
     assert 0.2 * len(mask) < mask.sum() < 0.5 * len(mask)
     before, after = (render(p, camera) for p in (parameters, pick(parameters, mask)))
@@ -59,7 +59,7 @@ def test_one_that_only_ends_pixels_is_needed(device, dtype):
     opacities = (0.98, 0.98, 0.9, 0.02)
     scene = together(*(one_splat(z=1.0 + k, opacity=a, scale=50.0) for k, a in enumerate(opacities)))
     parameters = {name: t.to(device, dtype) for name, t in scene.items()}
-    camera = on_device(settings(20, 20, dtype), device)
+    camera = move_camera(settings(20, 20, dtype), device)
     assert _blended(parameters, camera, raw=False).tolist() == [True, True, False, False]
     mask = _decisive(parameters, camera, raw=False)
     assert mask.tolist() == [True, True, True, False]
@@ -70,7 +70,7 @@ def test_one_that_only_ends_pixels_is_needed(device, dtype):
 @BOTH_AND_GPU
 def test_none_and_one_that_is_not_finite(device, dtype):
     parameters = {name: t.to(device, dtype) for name, t in together(one_splat(), one_splat(z=2.0)).items()}
-    camera = on_device(settings(20, 20, dtype), device)
+    camera = move_camera(settings(20, 20, dtype), device)
     assert _decisive(pick(parameters, []), camera, raw=False).shape == (0,)
     parameters["means"][0, 0] = math.nan
     assert _decisive(parameters, camera, raw=False).tolist() == [False, True]

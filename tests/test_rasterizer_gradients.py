@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import BOTH_AND_GPU, activated, few, on_device, ops, pick, render, rigid, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, activated, few, move_camera, ops, pick, render, rigid, scene_arguments
 
 from tests.workloads.splat_scenes import settings
 from utils.sh_utils import RGB2SH
@@ -90,7 +90,7 @@ def test_a_black_point_of_a_cloud_can_become_brighter(degree, device, dtype):
     parameters["sh_dc"] = RGB2SH(torch.zeros(1, 1, 3, dtype=dtype))
     parameters["sh_rest"] = torch.zeros_like(parameters["sh_rest"])
     inputs = {name: t.to(device).requires_grad_() for name, t in parameters.items()}
-    render(inputs, on_device(settings(**size, sh_degree=degree), device)).color.sum().backward()
+    render(inputs, move_camera(settings(**size, sh_degree=degree), device)).color.sum().backward()
     assert (inputs["sh_dc"].grad > 0).all()
 
 
@@ -129,7 +129,7 @@ def test_an_opacity_of_0_or_less_is_not_drawn(opacity, device, dtype):
     """Interpolated and masked opacities fall below 0; a logarithm of such a value must not count as opaque."""
     parameters, size = few(dtype=dtype)
     splats = {name: values.to(device) for name, values in activated(parameters).items()}
-    camera = on_device(settings(**size), device)
+    camera = move_camera(settings(**size), device)
     mask = torch.tensor([1.0, 0.0, 1.0], device=device, dtype=dtype)[:, None]
     masked = splats | {"opacities": torch.where(mask > 0, splats["opacities"], opacity).requires_grad_()}
     out = render(masked, camera, raw=False)

@@ -8,7 +8,7 @@ from diff_gaussian_rasterization import _C, GaussianRasterizer, optim
 from rasterizer_tools import CPU_AND_GPU, activated, few, leaves
 from torch import Tensor
 
-from tests.workloads.splat_scenes import on_device, settings
+from tests.workloads.splat_scenes import move_camera, settings
 
 EMPTY = torch.Tensor([])
 
@@ -32,7 +32,7 @@ def scene(colors: bool, covariances: bool, device: str = "cpu", **changes):
     for name in ("scales", "rotations") if covariances else ("cov3D_precomp",):
         del inputs[name]
     moved = {name: values.to(device) for name, values in inputs.items()}
-    return leaves(moved), on_device(settings(**size, **changes), device)
+    return leaves(moved), move_camera(settings(**size, **changes), device)
 
 
 def forward_arguments(inputs, camera) -> tuple:

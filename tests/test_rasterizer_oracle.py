@@ -16,7 +16,17 @@ import torch
 from diff_gaussian_rasterization import reference
 from diff_gaussian_rasterization.lens import Lens
 from lens_scenes import HEIGHT, PANORAMA, WIDTH, everywhere, lens, view_through
-from rasterizer_tools import BOTH_AND_GPU, Evaluated, activated, error, errors_above, evaluate, on_device, render, rigid
+from rasterizer_tools import (
+    BOTH_AND_GPU,
+    Evaluated,
+    activated,
+    error,
+    errors_above,
+    evaluate,
+    move_camera,
+    render,
+    rigid,
+)
 from torch import Tensor
 
 from tests.workloads.splat_scenes import KINDS, settings
@@ -172,7 +182,7 @@ def _oracle(name: str) -> tuple[dict[str, Tensor], Evaluated]:
 def test_outputs_and_gradients_agree_with_the_oracle(device, dtype, name):
     case, (parameters, wanted) = CASES[name], _oracle(name)
     assert wanted.keep.double().mean() > 0.99  # pixels left out are the exception
-    got = evaluate(parameters, on_device(case.camera(dtype), device), wanted.keep, device, raw=case.raw)
+    got = evaluate(parameters, move_camera(case.camera(dtype), device), wanted.keep, device, raw=case.raw)
     for plane, values in wanted.named.items():
         print(f"{name:40} {plane:16} {error(got.named[plane], values)}")
     bound = case.bounds[dtype == torch.float32]

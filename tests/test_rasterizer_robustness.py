@@ -12,7 +12,7 @@ from diff_gaussian_rasterization.lens import Lens
 from rasterizer_tools import CPU_AND_GPU, PLANES, activated, gradients, leaves, pick, render
 from torch import Tensor
 
-from tests.workloads.splat_scenes import KINDS, on_device, ordinary, settings
+from tests.workloads.splat_scenes import KINDS, move_camera, ordinary, settings
 
 N, VICTIM, SIZE = 40, 17, (75, 53)
 NOT_FINITE = [math.nan, math.inf, -math.inf]
@@ -97,7 +97,7 @@ def planes_of(inputs: dict[str, Tensor], camera, channels: int, means2d: Tensor)
 )
 def test_what_is_not_finite_at_a_pixel_is_of_those_that_reach_it(channels, options, camera, device):
     """Gradients of pixels, and channels of a Gaussian: elsewhere all has the bits of what is finite."""
-    camera = on_device(camera._replace(**options), device)
+    camera = move_camera(camera._replace(**options), device)
 
     def results(value: float, pixels: Tensor, gradient: float, others: float) -> tuple[list[Tensor], dict[str, Tensor]]:
         """Planes and gradients. value: the victim's. gradient, others: of the pixels, and a factor of others'."""

@@ -15,10 +15,10 @@ import torch
 from gaussians import model, pipeline
 from PIL import Image
 
-from applications.viewer.untrained import _spheres
+from applications.viewer.untrained import _make_spheres
 from gaussian_renderer.camera_paths import from_above, render_path, video
 from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
-from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle_cameras
 from scene.cameras import camera_to_JSON
 from scene.dataset_readers import read_scene
 from scene.with_splats import model_of
@@ -238,8 +238,8 @@ def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
 
 def test_a_picture_from_above_is_to_scale_whatever_the_height_and_without_what_no_camera_is_above(tmp_path, capsys):
     places = np.float32([[-1, 0.9, -1], [1, -0.3, -0.5], [0.3, 0.5, 1], [0, -40, 0]])
-    gaussians = model_of(_spheres(places, np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), 0.05))
-    scene = WithoutScene(gaussians, str(tmp_path), 7, circle(places[:3]))
+    gaussians = model_of(_make_spheres(places, np.float32([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]]), 0.05))
+    scene = WithoutScene(gaussians, str(tmp_path), 7, circle_cameras(places[:3]))
     background, pipe = torch.zeros(3), pipeline()
     path = from_above.render_top(scene, "", pipe, background, (400, 300))
     said = capsys.readouterr().out

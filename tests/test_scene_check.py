@@ -17,10 +17,10 @@ from synthetic import BROWN, HEIGHT, WIDTH, edit_json, make_blender_scene, make_
 from applications.convert.images import find_masks, find_shared_pixels
 from applications.convert.shared_masks import write_shared_masks
 from groundwork.finding import Finding, Severity
-from scene.checks.photo_files import _same_photos, of_blur
+from scene.checks.photo_files import _same_photos, check_blur
 from scene.checks.photos import check_photos
-from scene.checks.scene import check_dataset, findings, tell
-from scene.gaussians.copies import places_of
+from scene.checks.scene import check_dataset, findings, report
+from scene.gaussians.copies import clusters_of
 from scene.gaussians.start import start_rows
 from scene.images.decode import decode
 from scene.images.masks import MaskOptions
@@ -204,17 +204,17 @@ def test_blurred_photos_are_named_whatever_they_show(sound, tmp_path):
         (pixels.crop((0, 0, 200, 200)) if n > 5 else pixels).save(path)
         views.append(replace(view, image_path=path, image_name=path.name))
     info = read(sound)._replace(train_cameras=views)
-    (found,) = of_blur(info, 100)
+    (found,) = check_blur(info, 100)
     text = "4 of the {} photos that were checked look blurred (1.png, 3.png, 5.png, 7.png)"
     assert found.text == text.format(8)
-    assert [*of_blur(info._replace(train_cameras=views[::2]), 100)] == [*of_blur(_with_photos(COLORS), 9)] == []
+    assert [*check_blur(info._replace(train_cameras=views[::2]), 100)] == [*check_blur(_with_photos(COLORS), 9)] == []
     black = [replace(views[0], image_path=tmp_path / "black.png", image_name=f"black{n}") for n in range(8)]
     Image.new("RGB", (64, 48)).save(tmp_path / "black.png")
-    assert [*of_blur(info._replace(train_cameras=[*views[::2], *black]), 100)] == []
+    assert [*check_blur(info._replace(train_cameras=[*views[::2], *black]), 100)] == []
     for view in views:
         grey = np.asarray(Image.open(view.image_path).convert("L")).astype(np.uint16) * 257
         Image.fromarray(grey).save(view.image_path)
-    (found,) = of_blur(info._replace(train_cameras=[*views, *black]), 100)
+    (found,) = check_blur(info._replace(train_cameras=[*views, *black]), 100)
     assert found.text == text.format(16)
 
 
@@ -365,7 +365,7 @@ def test_points_that_are_there_several_times(apart, size):
     """Sizes are those of the cloud without copies, which at a few borders of cells are some percent off."""
     points = RANDOM.normal(size=(2000, 3)).astype(np.float32) * np.float32(size)
     copies = np.concatenate([points] * 4) + RANDOM.normal(scale=apart * size, size=(8000, 3)).astype(np.float32)
-    assert places_of(copies).misleads and not places_of(points).misleads
+    assert clusters_of(copies).hides_spacing and not clusters_of(points).hides_spacing
     scales = [
         start_rows(BasicPointCloud(x, x, x), size, 0)["scaling"][:2000, 0].exp().numpy() for x in (points, copies)
     ]
@@ -378,7 +378,7 @@ def test_a_few_pairs_change_nothing(sound):
     info = read(sound)
     points = info.point_cloud.points
     pairs = BasicPointCloud(*(np.concatenate([values, values[:20]]) for values in info.point_cloud))
-    assert not places_of(pairs.points).misleads and said(info._replace(point_cloud=pairs)) == ""
+    assert not clusters_of(pairs.points).hides_spacing and said(info._replace(point_cloud=pairs)) == ""
     four = BasicPointCloud(*(np.concatenate([values] * 4) for values in info.point_cloud))
     lines = said(info._replace(point_cloud=four))
     assert f"100% of the {4 * len(points)} points share a place with others, up to 4 in one" in lines
@@ -433,11 +433,11 @@ def test_published_scenes_are_passed(shared_dir, name):
 
 def test_what_a_training_prints(capsys):
     found = [Finding(f"fault {n}", "repair it") for n in range(7)]
-    tell(found, "garden")
+    report(found, "garden")
     lines = capsys.readouterr().err.splitlines()
     assert lines == [*(f"warning: fault {n}; repair it" for n in range(5)), "2 more: python doctor.py -s garden"]
     with pytest.raises(UserError, match="fault; repair it"):
-        tell([Finding("fault", "repair it", Severity.HOPELESS), *found], "garden")
+        report([Finding("fault", "repair it", Severity.HOPELESS), *found], "garden")
 
 
 def _longer(model) -> None:

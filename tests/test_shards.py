@@ -84,7 +84,7 @@ def _by_hand(gaussians: GaussianModel) -> None:
     """Steps one by one, with radii and a seed of torch's, and statistics that stay."""
     _adc(gaussians, 549, 550)
     gaussians.prune_points(_random(gaussians, "pruned") < -1)
-    gaussians.tmp_radii = gaussians.shards.items(torch.arange(len(gaussians)))
+    gaussians.tmp_radii = gaussians.shards.global_indices(torch.arange(len(gaussians)))
     torch.manual_seed(5)
     gaussians.densify_and_split(_random(gaussians, "split", 1).abs(), 0.5, EXTENT, N=3)
     gaussians.prune_points(_random(gaussians, "again") < -1)
@@ -96,7 +96,7 @@ def _emptied(gaussians: GaussianModel) -> None:
     """All rows of the first ranks are removed, then some rows are added, then nothing is."""
     _adc(gaussians, 549, 550)
     with torch.no_grad():
-        first = gaussians.shards.items(torch.arange(len(gaussians))) < 0.8 * gaussians.gaussian_count
+        first = gaussians.shards.global_indices(torch.arange(len(gaussians))) < 0.8 * gaussians.gaussian_count
         gaussians.raw("opacity")[first] = -9.0
     _adc(gaussians, 600, 601)
     _adc(gaussians, 700, densify_grad_threshold=1e6)
@@ -116,7 +116,7 @@ def _mcmc(gaussians: GaussianModel, **changes: object) -> None:
 def _mcmc_at_one_end(gaussians: GaussianModel) -> None:
     """Only the last Gaussian lives."""
     with torch.no_grad():
-        last = gaussians.shards.items(torch.arange(len(gaussians))) == gaussians.gaussian_count - 1
+        last = gaussians.shards.global_indices(torch.arange(len(gaussians))) == gaussians.gaussian_count - 1
         gaussians.raw("opacity")[:, 0] = torch.where(last, 2.0, -5.0)
     _mcmc(gaussians, max_num_splats=gaussians.gaussian_count + 30, mcmc_min_opacity=0.01)
 

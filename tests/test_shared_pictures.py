@@ -15,7 +15,7 @@ from trainings import PYRAMID
 
 import train
 from groundwork.ranks.ranks import ranks
-from groundwork.ranks.shared_images import holders
+from groundwork.ranks.shared_images import assign_holders
 from scene.images.store import ImageStore
 from splatting import resources
 from utils.system_utils import UserError
@@ -88,7 +88,7 @@ def _stores(paths: list[Path], size: tuple[int, int]) -> tuple:
         except UserError as error:
             got.append(str(error))
     changes = []
-    small = store.changed(paths[0], size, lambda pixels: changes.append(1) or pixels[:1, :1, :1].float() / 2)
+    small = store.transformed(paths[0], size, lambda pixels: changes.append(1) or pixels[:1, :1, :1].float() / 2)
     return store.planned_bytes, store.planned, len(store), got, [small.pixels.tolist() for _ in range(2)], len(changes)
 
 
@@ -107,5 +107,5 @@ def test_an_error_and_other_forms_reach_all_ranks(tmp_path):
 
 
 def test_the_rank_with_the_least_keeps_the_next():
-    assert holders([7] * 5, 3) == [0, 1, 2, 0, 1]
-    assert holders([30, 10, 30, 10, 30, 10], 2) == [0, 1, 1, 0, 0, 1]
+    assert assign_holders([7] * 5, 3) == [0, 1, 2, 0, 1]
+    assert assign_holders([30, 10, 30, 10, 30, 10], 2) == [0, 1, 1, 0, 0, 1]

@@ -21,7 +21,7 @@ from scene import Scene, export_world
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.start import LARGEST_OUTLIER
-from scene.readers.info import standing_apart
+from scene.readers.info import outliers
 from scene.saved_model import read_model
 from utils.system_utils import UserError
 
@@ -128,12 +128,12 @@ def test_a_camera_far_off_is_left_out_of_the_extent(colmap_scene, tmp_path, capf
 
 def test_which_cameras_stand_apart():
     ring = np.array([[np.cos(a), np.sin(a), 0] for a in np.linspace(0, 6, 8)])
-    assert not standing_apart(ring).any()
-    assert standing_apart(np.vstack([ring, [[9, 0, 0]]])).sum() == 0
-    assert standing_apart(np.vstack([ring, [[1e7, 0, 0]]])).tolist() == [False] * 8 + [True]
+    assert not outliers(ring).any()
+    assert outliers(np.vstack([ring, [[9, 0, 0]]])).sum() == 0
+    assert outliers(np.vstack([ring, [[1e7, 0, 0]]])).tolist() == [False] * 8 + [True]
     # If most are in one place, that is a tripod, and the others are valid.
-    assert not standing_apart(np.vstack([np.full((9, 3), 1 / 3), ring[:3]])).any()
-    assert not standing_apart(ring[:1]).any()
+    assert not outliers(np.vstack([np.full((9, 3), 1 / 3), ring[:3]])).any()
+    assert not outliers(ring[:1]).any()
 
 
 def test_stray_points_begin_small(colmap_scene, tmp_path, capfd):

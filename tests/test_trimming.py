@@ -22,7 +22,7 @@ from arguments import ModelParams, read_cfg_args
 from gaussian_renderer import decisive_for, render, trimming
 from gaussian_renderer.free_view import FRACTIONS, NEAREST, WIDER, neighbours, views_between
 from gaussian_renderer.scored_views import ScoredViews
-from gaussian_renderer.trimming import DONE, FAINT, FEW, TOO_LONG, change_on_views, decisive_for_any, trim, walk
+from gaussian_renderer.trimming import DONE, FAINT, FEW, TOO_LONG, change_on_views, decisive_for_any, trim, walk_pairs
 from scene import Scene
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -240,13 +240,13 @@ def test_few_unseen_ones_are_kept_without_looking_further(cameras):
 
 
 def test_many_cameras_have_fewer_neighbours(cameras):
-    pairs, views = walk(cameras, 10**6)
+    pairs, views = walk_pairs(cameras, 10**6)
     assert pairs == neighbours(cameras, NEAREST) and views == len(cameras) + 4 * len(pairs)
-    fewer, views = walk(cameras, views - 1)
+    fewer, views = walk_pairs(cameras, views - 1)
     assert fewer == neighbours(cameras, NEAREST - 1) and views == len(cameras) + 4 * len(fewer)
-    tree, views = walk(cameras, 5 * len(cameras) - 4)
+    tree, views = walk_pairs(cameras, 5 * len(cameras) - 4)
     assert len(tree) == len(cameras) - 1 and views == 5 * len(cameras) - 4
-    assert walk(cameras, views - 1) == ([], views)
+    assert walk_pairs(cameras, views - 1) == ([], views)
 
 
 def _standing(centers: np.ndarray, turns: Rotation, **changes: object) -> list[Camera]:

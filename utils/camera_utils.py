@@ -1,4 +1,4 @@
-"""The reference's names for what makes cameras of a dataset's views. Other code may replace them here."""
+"""The reference's names for functions that make cameras of a dataset's views. Other code may replace them here."""
 
 from scene.cameras import Camera, camera_to_JSON, cameraList_from_camInfos, loadCam
 

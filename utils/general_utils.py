@@ -53,7 +53,7 @@ def strip_lowerdiag(L: Tensor) -> Tensor:
 
 
 def strip_symmetric(sym: Tensor) -> Tensor:
-    """`strip_lowerdiag` of symmetric matrices (N,3,3), which loses nothing."""
+    """Do as `strip_lowerdiag` for symmetric matrices (N,3,3), of which nothing is lost."""
     return strip_lowerdiag(sym)
 
 
@@ -81,7 +81,7 @@ def get_expon_lr_func(
 
 
 class _StampedOutput:
-    """A text stream that ends each line with the time, ` [dd/mm HH:MM:SS]`, or prints nothing if silent."""
+    """A text stream that appends the time, ` [dd/mm HH:MM:SS]`, to each line, or prints nothing if silent."""
 
     def __init__(self, stream: TextIO, silent: bool) -> None:
         self.stream = stream

@@ -27,11 +27,11 @@ class BasicPointCloud(NamedTuple):
 
 
 def rigid_pose(R: np.ndarray, t: np.ndarray, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """A pose without the scale that some programs put into it: R and t as `world_to_camera` takes them.
+    """Divide out the scale that some programs put into a pose: return R and t for `world_to_camera`.
 
-    R is a rotation times a scale. Both are divided by it, which changes neither the camera's centre nor its image. A
-    scale within rounding of 1 leaves them as they are. UserError, naming the photo: R is mirrored, sheared or no
-    rotation at all, or a number is not finite.
+    R is a rotation times a scale. Division of R and t by the scale changes neither the camera's centre nor its image. A
+    scale within rounding of 1 changes nothing. UserError, naming the photo, if R is mirrored, sheared or no rotation at
+    all, or if a number is not finite.
     """
     matrix, shift = np.asarray(R, dtype=np.float64), np.asarray(t, dtype=np.float64)
     if not (np.isfinite(matrix).all() and np.isfinite(shift).all()):
@@ -67,7 +67,7 @@ def world_to_camera(R: np.ndarray, t: np.ndarray, translate: np.ndarray = _NOT_M
 def camera_center(R: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Centre (3,) of a camera in the world. R (3,3): camera-to-world rotation; t (3,): world-to-camera translation.
 
-    An R that is no rotation, as of a scaled pose, is inverted.
+    If R is no rotation, as in a scaled pose, its inverse is used.
     """
     R = np.asarray(R)
     is_rotation = np.abs(R.T @ R - np.eye(3)).max() <= 1e-3

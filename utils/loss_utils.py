@@ -1,4 +1,4 @@
-"""Losses between a render and its target: by fused kernels where they can, in plain PyTorch elsewhere."""
+"""Losses between a render and its target, by fused kernels where possible, else in plain PyTorch."""
 
 import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
@@ -40,8 +40,8 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
     """Structural similarity (Wang et al. 2004, eq. 13) per channel, with a Gaussian window and zeros outside the image.
 
     img1, img2: (C, H, W) or (B, C, H, W) in [0, 1]. Returns the mean over everything, or over each image of the batch
-    if `size_average` is off. Fused kernels compute it where they can: for a window of 11 pixels, and unless both images
-    need gradients. Their gradient cannot be differentiated again.
+    if `size_average` is off. Fused kernels compute it for a window of 11 pixels, unless both images need gradients;
+    their gradient cannot be differentiated again.
     """
     img1, img2 = (image[None] if image.dim() == 3 else image for image in (img1, img2))
     if window_size != WINDOW or not _kernels_fit(img1, img2):
@@ -55,7 +55,7 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
 
 
 def _kernels_fit(img1: Tensor, img2: Tensor) -> bool:
-    """Whether the fused kernels give the value and all gradients of the plain formula."""
+    """Tell whether the fused kernels give the value and all gradients of the plain formula."""
     both = torch.is_grad_enabled() and img1.requires_grad and img2.requires_grad
     if both or torch._C._are_functorch_transforms_active():
         return False
@@ -87,7 +87,7 @@ def create_window(window_size: int, channel: int) -> Tensor:
 def _ssim(
     img1: Tensor, img2: Tensor, window: Tensor, window_size: int, channel: int, size_average: bool = True
 ) -> Tensor:
-    """`ssim` with windows of the caller, as `create_window` makes them."""
+    """Do as `ssim` with the caller's windows (`create_window`)."""
 
     def blur(image: Tensor) -> Tensor:
         return F.conv2d(image, window, padding=window_size // 2, groups=channel)

@@ -1,8 +1,8 @@
 """LPIPS (Zhang et al. 2018, version 0.1), DISTS (Ding et al. 2020) and ST-LPIPS (Ghildyal and Liu 2022).
 
-The packages `lpips` and `DISTS-pytorch` bring the weights of features; those of the networks are torchvision's for
-ImageNet. They come from a given folder, or for LPIPS from torch's cache or a download into it. A network without
-weights is never used. `stlpips-pytorch` brings all weights.
+The packages `lpips` and `DISTS-pytorch` contain the weights of features; the networks have torchvision's weights for
+ImageNet, from a given folder, or for LPIPS from torch's cache or a download into it. A network without weights is never
+used. `stlpips-pytorch` contains all weights.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from unittest import mock
 import torch
 from torch import library, nn
 
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from groundwork.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
@@ -51,9 +51,9 @@ def import_lpips() -> ModuleType:
 def _import_with_torchvision(name: str) -> ModuleType:
     """Import a module that imports torchvision, also if torch is CPU-only.
 
-    There torchvision's wheel cannot load its compiled operators, and its Python side (0.28) fails when it attaches fake
-    kernels to two of them. The metrics need neither, so this declares their schemas and repeats the import. It does so
-    only after the failure, because the real operators' schemas would clash with these.
+    With a CPU-only torch, torchvision's wheel cannot load its compiled operators, and its Python side (0.28) fails when
+    it attaches fake kernels to two of them. The metrics need neither, so this function declares their schemas and
+    repeats the import, but only after the failure, because the real operators' schemas would clash with these.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -79,8 +79,8 @@ def _declare_missing_operators() -> None:
 def load_network(net: str, folder: Path | None, device: torch.device) -> nn.Module:
     """Load the module of the `lpips` package with one backbone of NETS, for evaluation, without gradients of its own.
 
-    folder: where torchvision's file of the backbone lies, under its own name; None: torch's cache, and then the
-    network. Raises LpipsUnavailable without weights, and UserError for a file that is missing or another one.
+    folder: the folder of torchvision's file of the backbone, under its own name; None: torch's cache, then a download.
+    Raises LpipsUnavailable without weights, and UserError for a missing or wrong file.
     """
     state = _features_from_cache(net) if folder is None else _load_state(weights_file(net, folder))
     lpips = import_lpips()
@@ -91,7 +91,7 @@ def load_network(net: str, folder: Path | None, device: torch.device) -> nn.Modu
 
 
 def load_dists(folder: Path, device: torch.device) -> nn.Module:
-    """Load the module of the package DISTS-pytorch, as `load_network` loads that of LPIPS.
+    """Load the module of the package DISTS-pytorch, as `load_network` does for LPIPS.
 
     Raises LpipsUnavailable without the package or torchvision's VGG-16 in the folder, and UserError for wrong files.
     """
@@ -112,7 +112,7 @@ def load_dists(folder: Path, device: torch.device) -> nn.Module:
 def import_stlpips() -> ModuleType:
     """Import the module of the package stlpips-pytorch that has its network. UserError without the package.
 
-    It imports two packages that it neither lists nor needs here, so others stand for them.
+    The package imports two others that it neither lists nor needs here, so stand-ins take their place.
     """
     unneeded = {"IPython", "torchsummary"} - sys.modules.keys()
     sys.modules.update(dict.fromkeys(unneeded, SimpleNamespace(embed=None, summary=None)))
@@ -127,7 +127,7 @@ def import_stlpips() -> ModuleType:
 
 
 def load_stlpips(device: torch.device) -> nn.Module:
-    """Load ST-LPIPS, whose arguments are those of LPIPS, by the package's default network. Nothing is downloaded."""
+    """Load ST-LPIPS, called like LPIPS, with the package's default network. Nothing is downloaded."""
     package = import_stlpips()
     model = package.LPIPS(pretrained=False, net="alex", variant="shift_tolerant", verbose=False)
     file = Path(package.__file__).with_name("weights") / "vST0.0" / "alex_shift_tolerant.pth"
@@ -138,7 +138,7 @@ def load_stlpips(device: torch.device) -> nn.Module:
 
 @contextlib.contextmanager
 def _without_weights(net: str) -> Iterator[None]:
-    """Let torchvision's network download and draw no weights: they lie nowhere until `_fill`."""
+    """Let torchvision's network neither download nor draw weights: they stay without memory until `_fill`."""
     models = importlib.import_module("torchvision.models")
     with torch.device("meta"):
         empty = getattr(models, NETS[net])()
@@ -147,7 +147,7 @@ def _without_weights(net: str) -> Iterator[None]:
 
 
 def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
-    """Give convolutions the weights of torchvision's `features`; names end in the layer there, and weight or bias."""
+    """Fill convolutions from torchvision's `features`; names there end in the layer, and weight or bias."""
     own = [name for name in model.state_dict() if name.endswith(("weight", "bias"))]
     try:
         found = {name: state[f"features.{name.split('.', 1)[1]}"] for name in own}
@@ -157,9 +157,9 @@ def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
 
 
 def _checked(file: Path, digest: str, remedy: str) -> Path:
-    """The file, whose SHA-256 begins with `digest`; UserError if it does not, or if there is none."""
+    """Return the file if its SHA-256 begins with `digest`; else, or if it is missing, UserError."""
     try:
-        found = hashlib.sha256(plain(file).read_bytes()).hexdigest()
+        found = hashlib.sha256(plain_path(file).read_bytes()).hexdigest()
     except OSError as error:
         raise UserError(f"cannot read {file} ({error.strerror}); {remedy}") from error
     if not found.startswith(digest):
@@ -168,7 +168,7 @@ def _checked(file: Path, digest: str, remedy: str) -> Path:
 
 
 def weights_file(net: str, folder: Path) -> Path:
-    """torchvision's file of a backbone in a folder; UserError if it is missing, damaged or another one."""
+    """Find torchvision's file of a backbone in a folder; UserError if it is missing, damaged or another one."""
     file = folder / Path(_url(net)).name
     if not file.exists():
         raise UserError(_lacking(file, net))
@@ -188,7 +188,7 @@ def _url(net: str) -> str:
 
 
 def _digest_of(file: Path) -> str:
-    """The first digits of the SHA-256, with which the names of torchvision's files end."""
+    """The first digits of the SHA-256, from the end of the name of a torchvision file."""
     return file.stem.rpartition("-")[2]
 
 
@@ -216,7 +216,7 @@ def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
 def _download(url: str, file: Path) -> bool:
     """Download a file whose name ends in the first digits of its SHA-256.
 
-    False if that fails, and at once if it has failed before or the environment forbids it (GS_DOWNLOAD=0, or
+    False if the download fails, and at once if one failed before or the environment forbids it (GS_DOWNLOAD=0, or
     TOLD).
     """
     global _network_failed

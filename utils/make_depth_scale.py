@@ -1,7 +1,7 @@
 """Fit a scene's depth maps to its COLMAP points.
 
-Maps of inverse depth get scale and offset each, in depth_params.json beside the model. Metric maps get one scale, in
-metric.json beside them.
+Each map of inverse depth gets a scale and an offset, in depth_params.json beside the model. Metric maps get one scale
+for all, in metric.json beside them.
 
 python utils/make_depth_scale.py --base_dir SCENE --depths_dir SCENE/depths
 """
@@ -31,7 +31,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="kind of the COLMAP model's files (default: bin)")  # fmt: skip
     args = parser.parse_args(argv)
     scene, depths = Path(args.base_dir), Path(args.depths_dir)
-    if metric := Metric.of(depths):
+    if metric := Metric.from_folder(depths):
         scale, spread, maps, photos = make_metric_scale(scene, depths, metric, args.model_type)
         print(
             f"{maps} of {photos} photos have a metric map: {scale:.4g} units of the scene for each metre, and half of "

@@ -11,8 +11,8 @@ from groundwork.files.writing import atomic_write, mkdir_p, temporary_folder, wr
 from groundwork.host import start, torchrun
 from groundwork.host.errors import UserError, first_line
 from groundwork.host.interrupt import Terminated, let_signals_end
-from groundwork.host.machine import compute_device, without_code
-from groundwork.host.memory import is_out_of_memory, shortage
+from groundwork.host.machine import compute_device, missing_code_message
+from groundwork.host.memory import describe_shortage, is_out_of_memory
 
 __all__ = [
     "Terminated",
@@ -36,12 +36,12 @@ _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 def run_cli(main: Callable[[], object], several: bool = False) -> None:
     """Run a command line: a UserError prints its sentence and exits 2; a bug keeps its traceback.
 
-    several: whether processes of torchrun can run it together (distributed/launcher.py); others refuse to.
+    several: whether processes of torchrun may run it together (groundwork/ranks/launcher.py); else they are refused.
 
     Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`). An
     output that cannot be written (disk full) exits 2, and one that is closed does not matter.
     """
-    start.imported()
+    start.after_imports()
     try:
         status = _status(main) if torchrun.size() == 1 else _status_of_several(main, several)
         sys.stdout.flush()  # now, while a broken pipe can still be caught
@@ -72,7 +72,7 @@ def _output_fails() -> bool:
 
 
 def _discard_output() -> None:
-    """Lead both streams nowhere: Python flushes them again when it exits, and either may be broken."""
+    """Discard both streams: Python flushes them again when it exits, and either may be broken."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (sys.__stdout__, sys.__stderr__):
         os.dup2(nowhere, stream.fileno())
@@ -96,17 +96,17 @@ def _status_of_several(main: Callable[[], object], several: bool) -> int:
 
 
 def _outcome(main: Callable[[], object]) -> tuple[int, str]:
-    """Run a command. Returns its exit status, and what there is to say on stderr."""
+    """Run a command. Returns its exit status, and the message for stderr."""
     try:
         main()
     except UserError as error:
         return 2, f"error: {error}"
     except (MemoryError, RuntimeError) as error:
-        if said := without_code(error):
+        if said := missing_code_message(error):
             return 2, f"error: {said}"
         if not is_out_of_memory(error):
             raise
-        reason = f"error: ran out of memory ({shortage(error, compute_device())})"
+        reason = f"error: ran out of memory ({describe_shortage(error, compute_device())})"
         return 2, f"{reason}; lower --resolution (-r), or free memory that other programs use"
     except Terminated:
         return 143, "terminated"
@@ -116,7 +116,7 @@ def _outcome(main: Callable[[], object]) -> tuple[int, str]:
 
 
 def saved_iterations(folder: str | os.PathLike) -> list[int]:
-    """Every N of the sub-folders `iteration_N`, ascending; empty if the folder is missing."""
+    """List every N of the sub-folders `iteration_N`, ascending; empty if the folder is missing."""
     names = os.listdir(folder) if os.path.isdir(folder) else []
     return sorted(int(match[1]) for name in names if (match := _ITERATION_FOLDER.fullmatch(name)))
 
@@ -135,7 +135,7 @@ def saved_ply(model_path: str | os.PathLike, iteration: int | str) -> Path:
 
 
 def find_iteration(model_path: str | os.PathLike, iteration: int) -> int:
-    """The iteration, -1: the last one saved. UserError if a model folder has no save of it."""
+    """Resolve an iteration, -1: the last one saved. UserError if the model folder has no save of it."""
     folder = Path(model_path) / "point_cloud"
     last = searchForMaxIteration(folder)
     if iteration == -1:

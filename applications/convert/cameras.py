@@ -26,12 +26,12 @@ class Group(NamedTuple):
         return f"{said}{place}: {' and '.join(map(str, self.lenses))}"
 
 
-def lenses(folder: Path, names: Sequence[str]) -> dict[str, Lens]:
+def read_lenses(folder: Path, names: Sequence[str]) -> dict[str, Lens]:
     """Read the lenses of photos below a folder, by name; a photo that is missing has none that is known."""
-    return dict(zip(names, _all(read_lens, folder, names), strict=True))
+    return dict(zip(names, _read_all(read_lens, folder, names), strict=True))
 
 
-def group(folder: Path, names: Sequence[str], mode: str) -> list[Group]:
+def group_photos(folder: Path, names: Sequence[str], mode: str) -> list[Group]:
     """Divide photos below a folder by size and, as a mode of MODES says, by lens; in the order of first names.
 
     per_lens: a lens that EXIF does not name is taken for one lens for each sub-folder.
@@ -39,12 +39,12 @@ def group(folder: Path, names: Sequence[str], mode: str) -> list[Group]:
 
     def key(name: str, lens: Lens) -> object:
         parent = PurePosixPath(name).parent
-        apart = {"per_lens": (lens, None if lens.tells_apart else parent), "per_folder": parent, "per_photo": name}
+        apart = {"per_lens": (lens, None if lens.is_distinct else parent), "per_folder": parent, "per_photo": name}
         return apart.get(mode)
 
     groups: dict[object, Group] = {}
-    sizes = _all(picture_size, folder, names)
-    for (name, lens), size in zip(lenses(folder, names).items(), sizes, strict=True):
+    sizes = _read_all(picture_size, folder, names)
+    for (name, lens), size in zip(read_lenses(folder, names).items(), sizes, strict=True):
         found = groups.setdefault((size, key(name, lens)), Group(size, [], []))
         found.names.append(name)
         if lens not in found.lenses:
@@ -52,7 +52,7 @@ def group(folder: Path, names: Sequence[str], mode: str) -> list[Group]:
     return list(groups.values())
 
 
-def listing(groups: Sequence[Group]) -> str:
+def describe_groups(groups: Sequence[Group]) -> str:
     """Say which photos share a camera, a line for each."""
     if len(groups) == 1:
         return f"one camera for {groups[0]}"
@@ -63,7 +63,7 @@ def listing(groups: Sequence[Group]) -> str:
     return "\n".join([f"{len(groups)} cameras:", *lines, *more])
 
 
-def described(cameras: Sequence[dict[str, Any]], known: dict[str, Lens]) -> list[dict[str, Any]]:
+def describe_cameras(cameras: Sequence[dict[str, Any]], known: dict[str, Lens]) -> list[dict[str, Any]]:
     """Return the cameras of a model for the report, with their lenses' and photos' names."""
     found = []
     for camera in cameras:
@@ -73,5 +73,5 @@ def described(cameras: Sequence[dict[str, Any]], known: dict[str, Lens]) -> list
     return found
 
 
-def _all(read: Callable[[Path], Any], folder: Path, names: Sequence[str]) -> list[Any]:
+def _read_all(read: Callable[[Path], Any], folder: Path, names: Sequence[str]) -> list[Any]:
     return in_threads(lambda name: read(folder / name), names, disable=True)

@@ -1,6 +1,6 @@
-"""The last stage of a conversion: what the capture is worth, and its page, capture.html.
+"""The last stage of a conversion: judges the quality of the capture, and writes its page, capture.html.
 
-What the page shows is computed here; its texts are in capture.html.jinja.
+This module computes the contents of the page; its texts are in capture.html.jinja.
 """
 
 import base64
@@ -13,22 +13,22 @@ import jinja2
 import numpy as np
 from PIL import Image, ImageOps
 
-from applications.convert.capture import compared, looks_of
-from applications.convert.findings import (
+from applications.convert.checks import (
     LONELY,
     Look,
+    describe_capture,
+    find_neighbours,
     is_wrong,
-    lines_of,
-    neighbours_of,
+    rate_capture,
     training_options,
-    unusable,
-    worth,
+    why_unusable,
 )
 from applications.convert.layout import Layout, image_names
-from applications.convert.mapping import name_of
-from applications.convert.report import summary
+from applications.convert.mapping import way_name
+from applications.convert.photo_quality import compare_brightness, measure_looks
+from applications.convert.report import summarise
 from applications.convert.stages import Stage
-from groundwork.files.color_profiles import in_srgb
+from groundwork.files.color_profiles import to_srgb
 from groundwork.files.image_files import UNREADABLE, open_image
 from groundwork.files.json_files import read_json, write_json
 from groundwork.host.progress import in_threads
@@ -42,16 +42,16 @@ _Data = Mapping[str, Any]  # of a JSON file
 
 
 def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], dict[str, float]]) -> Stage:
-    """Make the stage that looks at the finished scene, adds what it is worth to the report, and writes the page.
+    """Make the stage that rates the finished scene, adds the rating to the report, and writes the page.
 
-    seconds: of the stages before.
+    seconds: returns those of the stages before.
     """
 
     def work() -> None:
         survey, root = read_json(layout.capture), layout.prepared if layout.prepared.is_dir() else layout.input
-        looks = compared(looks_of(root, image_names(root)), layout)
+        looks = compare_brightness(measure_looks(root, image_names(root)), layout)
         report = read_json(layout.report)
-        report |= {"seconds": seconds()} | worth(report, survey["photos"], looks)
+        report |= {"seconds": seconds()} | rate_capture(report, survey["photos"], looks)
         write_json(layout.report, report)
         write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)
 
@@ -61,7 +61,12 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
 def write_page(
     path: Path, report: _Data, survey: _Data, looks: Mapping[str, Look], names: Sequence[str], root: Path
 ) -> None:
-    """Write the page. survey: the content of capture.json. names: of all photos, in order. root: their folder."""
+    """Write the page.
+
+    survey: the content of capture.json.
+    names: of all photos, in order.
+    root: the folder of the photos.
+    """
     photos = _photos(report, survey["photos"], looks, names)
     pictured = [photo for photo in photos if photo["problems"] or len(photos) <= _MOST][:_MOST]
     files = [root / photo["name"] for photo in pictured]
@@ -71,8 +76,8 @@ def write_page(
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
     text = environment.get_template("capture.html.jinja").render(
-        above=_from_above(survey), is_wrong=is_wrong, name_of=name_of, lines=_lines(report), photos=photos,
-        pictured=len(pictured), report=report, scene=path.absolute().parent.name, unusable=unusable(report),
+        above=_from_above(survey), is_wrong=is_wrong, way_name=way_name, lines=_lines(report), photos=photos,
+        pictured=len(pictured), report=report, scene=path.absolute().parent.name, unusable=why_unusable(report),
     )  # fmt: skip
     with atomic_write(path) as temporary:
         # Names that are not UTF-8 have surrogates, which appear as numbers.
@@ -80,19 +85,19 @@ def write_page(
 
 
 def _lines(report: _Data) -> list[tuple[str, bool]]:
-    """The lines of the report but what to photograph again, each with whether it tells of a problem."""
+    """List the lines of the report but those on photos to take, each with True if it tells of a problem."""
     found = {"overlap": report["weakly_connected"], "blur": report["blurred"], "brightness": training_options(report)}
-    said = lines_of(report)[: -len(report["again"]) or None]  # what to photograph again comes last
+    said = describe_capture(report)[: -len(report["again"]) or None]  # photos to take again come last
     return [
-        (summary(report), bool(report["left_out"])),
+        (summarise(report), bool(report["left_out"])),
         *((line, bool(found.get(line.split(":")[0]))) for line in said),
         *((line, True) for line in report["advice"]),
     ]
 
 
 def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequence[str]) -> list[dict[str, Any]]:
-    """Of each photo its name, problems and facts by title, those with problems first; `row` numbers them."""
-    neighbours, against = neighbours_of(placed), set((report.get("tried") or [{}])[0].get("against", ()))
+    """Return name, problems and facts (by title) of each photo, photos with problems first; `row` numbers them."""
+    neighbours, against = find_neighbours(placed), set((report.get("tried") or [{}])[0].get("against", ()))
     sharpness = np.median([look.sharpness for look in looks.values() if np.isfinite(look.sharpness)] or [1])
     brightness = np.median([look.brightness for look in looks.values() if np.isfinite(look.brightness)] or [0])
     lonely = {name for name in against if report["left_out"].get(name, {}).get("partners", 0) <= LONELY}
@@ -124,7 +129,7 @@ def _thumbnail(path: Path) -> str | None:
     try:
         with open_image(path) as image:
             image.draft("RGB", (2 * _THUMBNAIL, 2 * _THUMBNAIL))  # decodes a large JPEG at a fraction of its size
-            small = in_srgb(ImageOps.exif_transpose(image)).convert("RGB")
+            small = to_srgb(ImageOps.exif_transpose(image)).convert("RGB")
     except UNREADABLE:
         return None
     small.thumbnail((_THUMBNAIL, _THUMBNAIL))

@@ -66,16 +66,17 @@ def worker_command(layout: Layout, step: str, **job: Any) -> Command:
 
 
 def is_native(lenses: str, models: Collection[str]) -> bool:
-    """Whether photos stay as they are, by --lenses and the camera models. UserError for panoramas to undistort."""
+    """Tell if photos stay as they are, by --lenses and the camera models. UserError for panoramas to undistort."""
     if lenses == "undistort" and PANORAMA in models:
         raise UserError("no pinhole image shows a panorama; omit --lenses undistort")
     return lenses == "native" or (lenses == "auto" and not _WIDE.isdisjoint(models))
 
 
 class Backend:
-    """What computes features, matches and models. identity: program and version; another's results are not resumed.
+    """Makes the commands that compute features, matches and models, a list for each step.
 
-    Each step is a list of commands. groups: lists of names; the images of a list have one size and share a camera.
+    identity: program and version. Results of another program or version are not resumed.
+    groups: lists of names; the images of a list have one size and share a camera.
     """
 
     identity: str
@@ -226,12 +227,12 @@ def count_rows(database: Path, table: str) -> int:
     return rows[0][0] if rows else 0
 
 
-def names_in(database: Path) -> list[str]:
+def list_photos(database: Path) -> list[str]:
     """List the photos of a database, sorted."""
     return sorted(name for (name,) in _query(database, "SELECT name FROM images"))
 
 
-def most_features(database: Path) -> int:
+def count_most_features(database: Path) -> int:
     """Return the largest number of features of a photo."""
     rows = _query(database, "SELECT MAX(rows) FROM keypoints")
     return (rows[0][0] or 0) if rows else 0
@@ -255,7 +256,7 @@ def copy_database(database: Path, target: Path) -> None:
         source.backup(copy)
 
 
-def partners(database: Path) -> dict[str, int]:
+def count_partners(database: Path) -> dict[str, int]:
     """Count, for every photo, the other photos with which its matches passed the geometric check."""
     names = dict(_query(database, "SELECT image_id, name FROM images"))
     counts = Counter({name: 0 for name in names.values()})

@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any
 
 from applications.convert import stages
-from applications.convert.adding import added_line, forget_base, keep_base
+from applications.convert.adding import describe_added, forget_base, keep_base
 from applications.convert.cameras import MODES
 from applications.convert.capture_page import capture_stage
+from applications.convert.checks import describe_capture, training_options, why_unusable
 from applications.convert.colmap import ADDING, GIVEN, LENS_MODELS, PANORAMA, Program, Pycolmap, Settings, is_native
-from applications.convert.findings import lines_of, training_options, unusable
 from applications.convert.images import find_panoramas
-from applications.convert.inputs import Inputs, sort_inputs, unused_lines
+from applications.convert.inputs import Inputs, describe_unused, sort_inputs
 from applications.convert.layout import (
     FEWEST,
     Layout,
@@ -35,14 +35,14 @@ from applications.convert.layout import (
     scene_folder,
     take_photos_beside,
 )
-from applications.convert.orienting import said_of
+from applications.convert.orienting import describe_orientation
 from applications.convert.programs import refuse_while_working
-from applications.convert.report import lens_words, report_inputs, summary
-from applications.convert.video import FRAMES_MISSING, NOTE, report_entries, taken_frames, video_lines
+from applications.convert.report import describe_lenses, record_inputs, summarise
+from applications.convert.video import FRAMES_MISSING, NOTE, describe_videos, list_report_entries, list_taken_frames
 from arguments import OptionParser
 from groundwork.host.listing import some
 from groundwork.host.start import typed_command
-from scene.checks.conversion import awaits_conversion, stages_of, state_of
+from scene.checks.conversion import awaits_conversion, file_state, read_stages
 from scene.readers.scene_folder import WORK, find_capture, is_scene
 from utils.system_utils import UserError
 
@@ -52,8 +52,8 @@ _BESIDE_POSES = ("camera", "mapper", "video", "skip_matching", "colmap_executabl
 
 def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> None:
     """Run the stages that are not done; print how many photos were placed, and advice about the others."""
-    masks = _masks(args.mask_path)
-    videos = _videos(args.video)
+    masks = _check_masks(args.mask_path)
+    videos = _check_videos(args.video)
     if not args.skip_matching:
         take_photos_beside(layout, bool(videos))
     found = None if videos else find_images(layout, args.skip_unreadable)
@@ -66,18 +66,18 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     kept = []
     if videos:
         kept = record.run([_video_stage(layout, videos, args)])
-        print("\n".join(video_lines(layout)))
+        print("\n".join(describe_videos(layout)))
         found = find_images(layout, args.skip_unreadable, but=videos)
-    for line in unused_lines(found.unused):
+    for line in describe_unused(found.unused):
         print(line)
     names = found.photos
     if not (args.camera or args.poses or args.add or args.skip_matching):
-        settings = _for_panoramas(settings, layout, names)
-    record.note("files", {name: state_of(layout.input / name) for name in names})
+        settings = _detect_panoramas(settings, layout, names)
+    record.note("files", {name: file_state(layout.input / name) for name in names})
     if args.skip_matching:
         planned = []
         program = "--skip_matching: the model that was in distorted/sparse"
-        made_from = [names, stages.model_state(layout)]
+        made_from = [names, stages.read_model_state(layout)]
     else:
         program = args.colmap_executable
         backend = Program(program, layout, settings) if program else Pycolmap(layout, settings)
@@ -93,14 +93,14 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
     made = {"camera": settings.camera, "mapper": settings.mapper, "matcher": settings.matcher, "program": program}
     planned.append(stages.undistortion_stage(layout, settings, record, made_from, **made, shared_by=settings.cameras))
     planned.append(capture_stage(layout, names, record.seconds))
-    planned += stages.wanted_stages(layout, record, args)
+    planned += stages.requested_stages(layout, record, args)
     kept += record.run(planned)
     if kept:
         print(f"reused from an earlier run: {', '.join(kept)}; remove {layout.work} to start from the beginning")
-    _conclude(layout, found, args.add)
+    _print_outcome(layout, found, args.add)
 
 
-def _for_panoramas(settings: Settings, layout: Layout, names: Sequence[str]) -> Settings:
+def _detect_panoramas(settings: Settings, layout: Layout, names: Sequence[str]) -> Settings:
     """Take the lens of panoramas if the photos' XMP data name it; else say that photos of such sizes may be some."""
     wide, marked = find_panoramas(layout.input, names)
     if len(marked) == len(names):
@@ -113,21 +113,25 @@ def _for_panoramas(settings: Settings, layout: Layout, names: Sequence[str]) -> 
     return settings
 
 
-def _conclude(layout: Layout, found: Inputs, adding: bool) -> None:
-    """Print what came out, and how to train it; exit with status 3 if it is not to be trained."""
-    notes = [NOTE] if taken_frames(layout) else []
-    report = report_inputs(layout.report, notes=notes, unused=found.unused, videos=report_entries(layout))
-    print("\n".join((summary(report), lens_words(report), *lines_of(report), *said_of(layout))))
-    print(f"all of it: {layout.page}")
+def _print_outcome(layout: Layout, found: Inputs, adding: bool) -> None:
+    """Print the results, and the command that trains the scene; exit with status 3 if it should not be trained."""
+    notes = [NOTE] if list_taken_frames(layout) else []
+    report = record_inputs(layout.report, notes=notes, unused=found.unused, videos=list_report_entries(layout))
+    print(
+        "\n".join(
+            (summarise(report), describe_lenses(report), *describe_capture(report), *describe_orientation(layout))
+        )
+    )
+    print(f"Report: {layout.page}")
     if found.unused:
         print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
     if adding:
-        print(added_line(layout, report["left_out"]))
+        print(describe_added(layout, report["left_out"]))
     for line in notes:
         print(f"note: {line}")
     for line in report["advice"]:
         print(f"warning: {line}", file=sys.stderr)
-    if text := unusable(report):
+    if text := why_unusable(report):
         print(f"warning: {text}", file=sys.stderr)
         sys.exit(3)
     folders = f"-s {shlex.quote(str(layout.scene))} -m {shlex.quote(f'output/{layout.scene.resolve().name}')}"
@@ -135,19 +139,19 @@ def _conclude(layout: Layout, found: Inputs, adding: bool) -> None:
 
 
 def convert_first(source: str) -> None:
-    """For train.py: convert a folder of photos or videos that has no cameras yet, or finish what was begun.
+    """Convert a folder of photos or videos that has no cameras yet, or finish its conversion, before train.py.
 
-    Do nothing with any other folder. The photos are in its sub-folder `input`, or directly in it.
+    Do nothing with any other folder. The photos are in the sub-folder `input`, or directly in the folder.
     """
     folder = Path(source)
     if not awaits_conversion(folder):
         return
     found = find_capture(folder.absolute())
     words, begun = ["--video", *map(str, found.videos)] if found.is_video else [], None
-    if stages_of(folder):
+    if read_stages(folder):
         there = f"; to train what is there, remove {folder / WORK}" if is_scene(folder) else ""
         print(f"a conversion of {folder} was not finished: finishing it first{there}")
-        begun = _begun_options(folder)
+        begun = _read_begun_options(folder)
     else:
         print(f"{folder} has no cameras: converting what is in it first, as convert.py does without options")
         if found.is_video and found.photos:
@@ -155,10 +159,10 @@ def convert_first(source: str) -> None:
     main(["-s", str(folder.absolute()), *(words if begun is None else ())], **begun or {})
 
 
-def _begun_options(folder: Path) -> dict[str, Any] | None:
+def _read_begun_options(folder: Path) -> dict[str, Any] | None:
     """Return the options of the conversion that was begun in a folder; None if files that they name are gone."""
     try:
-        options = dict(stages_of(folder)["options"]["made_from"])
+        options = dict(read_stages(folder)["options"]["made_from"])
         named = [*options.get("video", []), *filter(None, map(options.get, _NAMING))]
         complete = all(map(os.path.exists, named))
     except (KeyError, TypeError, ValueError):
@@ -168,7 +172,7 @@ def _begun_options(folder: Path) -> dict[str, Any] | None:
     return options if complete else None
 
 
-def _masks(given: str | None) -> Path | None:
+def _check_masks(given: str | None) -> Path | None:
     """Return the folder of --mask_path. UserError if it is none: later it would pass for a folder without masks."""
     if given is None:
         return None
@@ -177,7 +181,7 @@ def _masks(given: str | None) -> Path | None:
     return Path(given)
 
 
-def _videos(given: Sequence[str]) -> list[Path]:
+def _check_videos(given: Sequence[str]) -> list[Path]:
     videos = [Path(name) for name in given]
     for path in videos:
         if not path.is_file():
@@ -192,8 +196,8 @@ def _video_stage(layout: Layout, videos: Sequence[Path], args: argparse.Namespac
     return stages.video_stage(layout, videos, args.video_frames)
 
 
-def _settings(args: argparse.Namespace) -> Settings:
-    """The choices of the command line. UserError for those that do not fit together."""
+def _make_settings(args: argparse.Namespace) -> Settings:
+    """Return the settings of the command line. UserError for options that do not fit together."""
     of_matching = "camera", "cameras", "mapper", "matcher", "mask_path", "colmap_executable"
     if args.skip_matching and (ignored := [f"--{name}" for name in of_matching if getattr(args, name)]):
         print(f"warning: --skip_matching ignores {', '.join(ignored)}, as the model is there", file=sys.stderr)
@@ -214,7 +218,7 @@ def _settings(args: argparse.Namespace) -> Settings:
 
 
 def _refuse_beside(option: str, reason: str, args: argparse.Namespace, *others: str) -> None:
-    """Raise UserError for another option that says what an option says, or that needs what it leaves out."""
+    """Raise UserError for options that do not go with one: they say the same, or need what that one leaves out."""
     for other in others:
         if getattr(args, other):
             raise UserError(f"--{other} does not go with --{option}, {reason}; omit one")
@@ -273,6 +277,6 @@ def main(argv: Sequence[str] | None = None, **options: Any) -> None:
             raise UserError(f"--{option} must be at least {least}, got {getattr(args, option)}")
     layout = Layout(scene_folder(args.source_path, made=bool(args.video)))
     try:
-        convert(layout, _settings(args), args)
+        convert(layout, _make_settings(args), args)
     except json.JSONDecodeError as error:
         raise UserError(f"a report in {layout.scene} is damaged; remove {layout.work} to begin anew") from error

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, grid_sample
 
-from groundwork.files.color_profiles import in_srgb
+from groundwork.files.color_profiles import to_srgb
 from groundwork.files.image_files import open_image
 from groundwork.host.progress import Bar, in_threads
 
@@ -53,7 +53,7 @@ class View(NamedTuple):
 def add_points(folder: Path, shared: Mapping[str, Mapping[str, int]], no_gpu: bool) -> int:
     """Add points without tracks to the model in `sparse` of a folder, whose photos are in `images`; return how many.
 
-    Photos with other cameras than pinholes get none. shared: as of `more_points`.
+    Photos with other cameras than pinholes get none. shared: as of `find_points`.
     """
     import pycolmap  # after Pillow
 
@@ -61,14 +61,14 @@ def add_points(folder: Path, shared: Mapping[str, Mapping[str, int]], no_gpu: bo
     if any(camera.model_name not in ("PINHOLE", "SIMPLE_PINHOLE") for camera in model.cameras.values()):
         return 0
     device = torch.device("cuda" if torch.cuda.is_available() and not no_gpu else "cpu")
-    points, colors = more_points(model, folder / "images", shared, device)
+    points, colors = find_points(model, folder / "images", shared, device)
     for point, color in zip(points, colors, strict=True):
         model.add_point3D(point, pycolmap.Track(), color)
     model.write(str(folder / "sparse"))
     return len(points)
 
 
-def more_points(
+def find_points(
     model: Any, photos: Path, shared: Mapping[str, Mapping[str, int]], device: torch.device
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find points (N, 3) of a COLMAP model with pinhole cameras, and their colours (N, 3) uint8.
@@ -80,7 +80,7 @@ def more_points(
     # Far from the origin, as maps are, float32 has few digits left.
     origin = np.mean([image.projection_center() for image in images.values()], axis=0) if images else np.zeros(3)
     depths = {name: _depths(model, image) for name, image in images.items()}
-    others = {name: _others(images, name, shared.get(name, {}), depths[name]) for name in sorted(images)}
+    others = {name: _choose_others(images, name, shared.get(name, {}), depths[name]) for name in sorted(images)}
     names = [name for name, found in others.items() if len(found) >= 2]
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
     views: dict[str, View] = {}
@@ -94,7 +94,7 @@ def more_points(
             views |= zip(new, in_threads(load, new, disable=True), strict=True)
             for number, name in enumerate(part, start):
                 beside = [views[other] for other in others[name]]
-                found, shades = _of_photo(views[name], beside, depths[name], each, number)
+                found, shades = _find_points_of_photo(views[name], beside, depths[name], each, number)
                 points.append(found)
                 colors.append(shades)
                 bar.update()
@@ -109,8 +109,8 @@ def _depths(model: Any, image: Any) -> np.ndarray:
     return (places.reshape(-1, 3) @ pose.rotation.matrix().T + pose.translation)[:, 2]
 
 
-def _others(images: Mapping[str, Any], name: str, shared: Mapping[str, int], depths: np.ndarray) -> list[str]:
-    """Photos that share most points with one, and see them from another side."""
+def _choose_others(images: Mapping[str, Any], name: str, shared: Mapping[str, int], depths: np.ndarray) -> list[str]:
+    """Choose the photos that share most points with a photo, and see them from another direction."""
     if len(depths) < 3:
         return []
     center, middle = images[name].projection_center(), float(np.median(depths))
@@ -128,7 +128,7 @@ def _load(images: Mapping[str, Any], folder: Path, origin: np.ndarray, device: t
         scale = min(1.0, SIDE / max(photo.size))
         size = tuple(round(side * scale) for side in photo.size)
         photo.draft("RGB", size)
-        colors = np.asarray(in_srgb(photo).convert("RGB").resize(size))
+        colors = np.asarray(to_srgb(photo).convert("RGB").resize(size))
     intrinsics = torch.tensor(image.camera.calibration_matrix(), dtype=torch.float32)
     intrinsics[:2] *= torch.tensor([[size[0] / image.camera.width], [size[1] / image.camera.height]])
     pose = image.cam_from_world()
@@ -138,21 +138,21 @@ def _load(images: Mapping[str, Any], folder: Path, origin: np.ndarray, device: t
     return View(grey, colors, *(part.to(device) for part in (*placed, intrinsics)))
 
 
-def _of_photo(
+def _find_points_of_photo(
     view: View, others: Sequence[View], depths: np.ndarray, count: int, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (N, 3) and colours (N, 3) of a photo."""
-    pixels = _textured(view.grey, count, seed)  # (P, 2)
+    pixels = _choose_textured(view.grey, count, seed)  # (P, 2)
     low, high = np.quantile(depths, (0.02, 0.98))
     if high <= 0 or not len(pixels):
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     ends = 1 / (_FAR * high), 1 / (_NEAR * max(low, high / _SPAN))
     steps = torch.linspace(*ends, _DEPTHS, device=pixels.device).expand(len(pixels), -1)
-    scores = _agreement(view, others, pixels, steps, _COARSE, _PATCH[1])
+    scores = _measure_agreement(view, others, pixels, steps, _COARSE, _PATCH[1])
     best = scores.argmax(1, keepdim=True)
     width = (ends[1] - ends[0]) / (_DEPTHS - 1)
     fine = steps.gather(1, best) + torch.linspace(-width, width, _STEPS, device=pixels.device)
-    scores = _agreement(view, others, pixels, fine.clamp_min(1e-9), 1, _PATCH[0])
+    scores = _measure_agreement(view, others, pixels, fine.clamp_min(1e-9), 1, _PATCH[0])
     score, best = scores[:, 1:-1].max(1)
     near = torch.stack([scores.gather(1, best[:, None] + k)[:, 0] for k in range(3)])
     bend = (near[0] - 2 * near[1] + near[2]).clamp_max(-1e-6)
@@ -165,7 +165,7 @@ def _of_photo(
     return points.double().cpu().numpy(), view.colors[rows, columns]
 
 
-def _textured(grey: torch.Tensor, count: int, seed: int) -> torch.Tensor:
+def _choose_textured(grey: torch.Tensor, count: int, seed: int) -> torch.Tensor:
     """Pixels (P, 2), x and y: of each cell of a grid a random one whose patch has texture."""
     radius = _COARSE * _PATCH[1]
     mean, square = (avg_pool2d(part, 2 * _PATCH[0] + 1, 1, _PATCH[0]) for part in (grey, grey**2))
@@ -180,17 +180,20 @@ def _textured(grey: torch.Tensor, count: int, seed: int) -> torch.Tensor:
     return places[rough[places[:, 1], places[:, 0]]].float()
 
 
-def _agreement(
+def _measure_agreement(
     view: View, others: Sequence[View], pixels: torch.Tensor, inverse: torch.Tensor, factor: int, radius: int
 ) -> torch.Tensor:
-    """How well others agree (P, D) with patches of a photo at inverse depths (P, D): the second best correlation.
+    """Return the second best correlation (P, D) of a photo's patches with other photos, at inverse depths (P, D).
 
-    factor: by which the photos are made smaller. radius: of a patch, in their pixels.
+    pixels: (P, 2), the middles of the patches.
+    inverse: (P, D), 1 / world units.
+    factor: by which the photos are made smaller.
+    radius: of a patch, in pixels of the smaller photos.
     """
     offsets = torch.arange(-radius, radius + 1, device=pixels.device, dtype=torch.float32) * factor
     offsets = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), -1).reshape(-1, 2)
     places = pixels[:, None] + 0.5 + offsets  # (P, K, 2)
-    own = _normed(_sample(view.grey, places[:, None], factor))
+    own = _normalize_patches(_sample(view.grey, places[:, None], factor))
     rays = _rays(view.intrinsics, places)[:, None]  # (P, 1, K, 3)
     found = []
     for other in others:
@@ -201,7 +204,9 @@ def _agreement(
             along[..., axis] + shift[axis] * inverse[..., None] for axis in range(3)
         )  # times the inverse depth
         depth = torch.where(depth > 1e-9, depth, torch.nan)  # not what is behind: it is shown nowhere
-        found.append((own * _normed(_sample(other.grey, torch.stack([x / depth, y / depth], -1), factor))).sum(-1))
+        found.append(
+            (own * _normalize_patches(_sample(other.grey, torch.stack([x / depth, y / depth], -1), factor))).sum(-1)
+        )
     return torch.stack(found).topk(2, dim=0).values[1]
 
 
@@ -214,7 +219,7 @@ def _sample(grey: torch.Tensor, places: torch.Tensor, factor: int) -> torch.Tens
     return grid_sample(small, grid, align_corners=False).reshape(places.shape[:-1])
 
 
-def _normed(patches: torch.Tensor) -> torch.Tensor:
+def _normalize_patches(patches: torch.Tensor) -> torch.Tensor:
     """Patches (..., K) of mean 0 and length 1."""
     patches = patches - patches.mean(-1, keepdim=True)
     return patches / patches.norm(dim=-1, keepdim=True).clamp_min(1e-4)

@@ -59,32 +59,34 @@ class Fit(NamedTuple):
 
 
 def is_level(found: Fit) -> bool:
-    """Whether the vertical is known: to a degree by two standard errors, or as well as photos held by hand tell it."""
+    """Tell if the vertical is known: to a degree by two standard errors, or as well as hand-held photos tell it."""
     return found.tilt <= np.radians(0.45) or (np.isfinite(found.tilt) and found.by_level <= np.radians(4))
 
 
-def fit(cameras: Cameras, up: np.ndarray | None = None) -> Fit:
+def fit_level_frame(cameras: Cameras, up: np.ndarray | None = None) -> Fit:
     """The best fit; its `tilt` is infinite where the opposite vertical fits as well.
 
     up: (3,), a vertical of the world that is measured, and stays.
     """
     if up is not None:
-        return _refined(cameras, _upright(up), measured=True)
+        return _refine_fit(cameras, _upright_rotation(up), measured=True)
     normal = np.linalg.svd(cameras.centers - cameras.centers.mean(0))[2][2]
-    level = level_up(cameras.turns)
-    found = sorted((_refined(cameras, _upright(one)) for one in (level, -level, normal, -normal)), key=lambda f: f.cost)
+    level = find_level_up(cameras.turns)
+    found = sorted(
+        (_refine_fit(cameras, _upright_rotation(one)) for one in (level, -level, normal, -normal)), key=lambda f: f.cost
+    )
     equal = [one for one in found if one.cost < found[0].cost + _EQUAL]
     if all(one.rotation[1] @ found[0].rotation[1] > 0 for one in equal):
         return found[0]
-    shown, best = max(((_shown_up(cameras, one), one) for one in equal), key=lambda pair: pair[0])
+    shown, best = max(((_find_shown_up(cameras, one), one) for one in equal), key=lambda pair: pair[0])
     return best if shown > _UP else best._replace(tilt=np.inf)
 
 
-def _shown_up(cameras: Cameras, found: Fit) -> float:
+def _find_shown_up(cameras: Cameras, found: Fit) -> float:
     return float(np.median(cameras.turns[:, :, 1] @ found.rotation[1]))
 
 
-def level_up(turns: np.ndarray) -> np.ndarray:
+def find_level_up(turns: np.ndarray) -> np.ndarray:
     """The direction (3,), of length 1, that is up for most cameras: the one in which their rolls are least.
 
     turns: (N,3,3), from camera to world axes. A level camera has its x axis at right angles to up. So up is the
@@ -103,7 +105,7 @@ def level_up(turns: np.ndarray) -> np.ndarray:
     return up
 
 
-def _upright(up: np.ndarray) -> np.ndarray:
+def _upright_rotation(up: np.ndarray) -> np.ndarray:
     """The least rotation (3,3) that takes a direction to -y."""
     from scipy.spatial.transform import Rotation
 
@@ -113,7 +115,7 @@ def _upright(up: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix()
 
 
-def _started(cameras: Cameras, rotation: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+def _start_fit(cameras: Cameras, rotation: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
     """Rotation, scale and shift of the best similarity of the plan that two photos with GPS determine."""
     here = np.flatnonzero(np.isfinite(cameras.places[:, 0]))
     own, true = (values[here] @ [1, 0, 1j] for values in (cameras.centers @ rotation.T, np.nan_to_num(cameras.places)))
@@ -148,11 +150,11 @@ class _Rows(NamedTuple):
         return (self.slopes * self.weights[:, None]).T @ self.slopes
 
 
-def _refined(cameras: Cameras, rotation: np.ndarray, measured: bool = False) -> Fit:
+def _refine_fit(cameras: Cameras, rotation: np.ndarray, measured: bool = False) -> Fit:
     """The fit that Gauss and Newton's method finds from a level frame; `measured`: whose vertical stays."""
     from scipy.spatial.transform import Rotation
 
-    rotation, scale, shift = _started(cameras, rotation)
+    rotation, scale, shift = _start_fit(cameras, rotation)
     common, deviations = np.zeros(2), (GPS_ERROR, HEIGHT_ERROR)
     free = np.full(9, _UNKNOWN)  # weights of the unknowns without evidence
     for _ in range(_ROUNDS):

@@ -18,8 +18,8 @@ from utils.system_utils import UserError
 _ROUNDED = 1.5  # pixels by which a smaller copy's side may differ from the camera's proportions
 
 
-def files_of(source: Path) -> list[Path]:
-    """The files that tell the poses, of a camera file or of a model's folder. UserError where there are none."""
+def list_pose_files(source: Path) -> list[Path]:
+    """List the files that contain the poses: a camera file, or those of a model's folder. UserError without any."""
     if source.is_file():
         return [source]
     files = sorted(path for path in source.glob("*") if path.stem in ("cameras", "images")) if source.is_dir() else []
@@ -32,10 +32,10 @@ def files_of(source: Path) -> list[Path]:
 
 
 def write_given(layout: Layout, source: Path) -> None:
-    """Write `layout.given`, the poses and cameras of the prepared photos. `posed_photos` has the errors."""
+    """Write `layout.given`, the poses and cameras of the prepared photos. `find_posed_photos` has the errors."""
     cameras: dict[tuple[Lens, tuple[int, int]], int] = {}
     images = []
-    for name, posed, lens, size in posed_photos(layout, source):
+    for name, posed, lens, size in find_posed_photos(layout, source):
         rotation, translation = rigid_pose(posed.R, posed.T, name)
         number = cameras.setdefault((lens, size), len(cameras) + 1)
         pose = [[*row, shift] for row, shift in zip(rotation.T.tolist(), translation.tolist(), strict=True)]
@@ -44,13 +44,13 @@ def write_given(layout: Layout, source: Path) -> None:
     write_json(layout.given, {"cameras": content, "images": images})
 
 
-def posed_photos(layout: Layout, source: Path) -> list[tuple[str, Posed, Lens, tuple[int, int]]]:
-    """The prepared photos that have a pose, by name: name, pose, lens, and size of the photo.
+def find_posed_photos(layout: Layout, source: Path) -> list[tuple[str, Posed, Lens, tuple[int, int]]]:
+    """Find the prepared photos that have a pose; return name, pose, lens and size of each.
 
     UserError for poses, lenses or names that cannot be used, and for cameras whose proportions are not the photos'.
     """
     poses = (colmap if source.is_dir() else transforms).read_poses(source)
-    found = _by_photo(layout.prepared, poses, source)
+    found = _index_by_photo(layout.prepared, poses, source)
     if len(found) < FEWEST:
         listed = f", which lists {poses[0].file} first" if poses else ""
         raise UserError(
@@ -73,13 +73,13 @@ def posed_photos(layout: Layout, source: Path) -> list[tuple[str, Posed, Lens, t
     return photos
 
 
-def given_names(layout: Layout) -> list[str]:
-    """The photos of `layout.given`, in order."""
+def list_given(layout: Layout) -> list[str]:
+    """List the photos of `layout.given`, in order."""
     return [image["name"] for image in read_json(layout.given)["images"]]
 
 
-def _by_photo(folder: Path, poses: Sequence[Posed], source: Path) -> dict[str, Posed]:
-    """The poses by the names of the photos that they are of. UserError where two are of one photo."""
+def _index_by_photo(folder: Path, poses: Sequence[Posed], source: Path) -> dict[str, Posed]:
+    """Return the poses by the names of their photos. UserError where two poses are of one photo."""
     index, found = FileIndex(folder), {}
     for posed in poses:
         parts = PurePosixPath(posed.file.replace("\\", "/")).parts

@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image, ImageOps
 
 from applications.convert.layout import Layout, image_names
-from groundwork.files.color_profiles import has_other_colors, in_srgb
+from groundwork.files.color_profiles import has_other_colors, to_srgb
 from groundwork.files.color_tags import mark_srgb
 from groundwork.files.image_files import SUFFIXES, UNREADABLE, open_image
 from groundwork.finding import Finding
@@ -55,16 +55,16 @@ def prepare_images(layout: Layout, names: Sequence[str], masks: Path | None) -> 
             mask = layout.masks / prepared.relative_to(layout.prepared)
             _prepare_mask(with_mask.get(name), mask.with_name(f"{mask.name}.png"), prepared)
 
-    _in_threads(prepare, names, "Preparing photos")
+    _do_for_all(prepare, names, "Preparing photos")
 
 
-def prepared_names(layout: Layout, names: Sequence[str]) -> dict[str, str]:
+def name_prepared(layout: Layout, names: Sequence[str]) -> dict[str, str]:
     """The names that `prepare_images` gives photos, by their own; a photo that cannot be read keeps its own."""
     found, taken = {}, {layout.prepared / name for name in names}
     for name in names:
         found[name] = name
         with contextlib.suppress(*UNREADABLE), open_image(layout.input / name) as image:
-            target = _named(image, layout.prepared / name, taken)
+            target = _prepared_path(image, layout.prepared / name, taken)
             found[name] = target.relative_to(layout.prepared).as_posix()
     return found
 
@@ -75,13 +75,13 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
 
     def check(name: str) -> None:
         try:
-            size = upright_size(layout.input / name)
+            size = read_upright_size(layout.input / name)
         except UserError as error:
             raise UserError(f"{error}, {_OR_WITHOUT}") from error
         if name in with_mask:
             _check_mask(with_mask[name], name, size)
 
-    _in_threads(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
+    _do_for_all(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
     for found in find_shared_pixels(layout.input, names, with_mask):
         print(f"warning: {found}", file=sys.stderr)
 
@@ -123,7 +123,7 @@ def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Pa
     return found
 
 
-def sizes(layout: Layout) -> dict[tuple[int, int], list[str]]:
+def group_by_size(layout: Layout) -> dict[tuple[int, int], list[str]]:
     """Return the names of the prepared photos by size (width, height), in order."""
     groups: dict[tuple[int, int], list[str]] = {}
     for name in image_names(layout.prepared):
@@ -137,17 +137,17 @@ def resize_images(layout: Layout, factor: int) -> None:
     def resize(name: str) -> None:
         with open_image(layout.images / name) as image:
             size = tuple(max(1, round(side / factor)) for side in image.size)
-            _save(image.resize(size, Image.Resampling.BICUBIC), layout.resized(factor) / name, image)
+            _save_srgb(image.resize(size, Image.Resampling.BICUBIC), layout.resized(factor) / name, image)
 
-    _in_threads(resize, image_names(layout.images), f"Resizing to 1/{factor}")
+    _do_for_all(resize, image_names(layout.images), f"Resizing to 1/{factor}")
 
 
 def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
-    """Write the prepared photo and return its path, `_named`. taken: paths of other photos."""
+    """Write the prepared photo and return its path, `_prepared_path`. taken: paths of other photos."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with open_image(source) as image:
-            target = _named(image, target, taken)
+            target = _prepared_path(image, target, taken)
             if (
                 image.format in _LINKED
                 and image.getexif().get(_ORIENTATION, 1) in (0, 1)
@@ -158,15 +158,15 @@ def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
             upright = ImageOps.exif_transpose(image)
             exif = upright.getexif()
             mark_srgb(exif)
-            _save(upright, target, image, exif=exif)
+            _save_srgb(upright, target, image, exif=exif)
             return target
     except UNREADABLE as error:
         raise UserError(f"cannot rewrite the photo {source} for COLMAP ({error}); replace or remove it") from error
 
 
-def _named(image: Image.Image, target: Path, taken: Collection[Path]) -> Path:
+def _prepared_path(image: Image.Image, target: Path, taken: Collection[Path]) -> Path:
     """The path of a prepared photo: `target`, with the suffix of its format appended if it has none."""
-    end = _ENDS[_written(image)]
+    end = _ENDS[_written_format(image)]
     if target.suffix.lower() not in (set(SUFFIXES) - {".webp"} if image.format in _LINKED else {end}):
         target = target.with_name(target.name + end)
         while target in taken:
@@ -174,13 +174,13 @@ def _named(image: Image.Image, target: Path, taken: Collection[Path]) -> Path:
     return target
 
 
-def _written(image: Image.Image) -> str:
+def _written_format(image: Image.Image) -> str:
     """The format in which a photo is written."""
     written = _WRITTEN.get(image.format, "PNG")
     return "PNG" if written == "JPEG" and image.has_transparency_data else written
 
 
-def upright_size(photo: Path) -> tuple[int, int]:
+def read_upright_size(photo: Path) -> tuple[int, int]:
     width, height = picture_size(photo, colors=True)  # UserError for a truncated file or one of another kind
     try:
         with open_image(photo) as image:
@@ -212,13 +212,13 @@ def _prepare_mask(source: Path | None, target: Path, photo: Path) -> None:
     Image.fromarray(kept).save(target)
 
 
-def _save(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:
+def _save_srgb(image: Image.Image, target: Path, like: Image.Image, **options: object) -> None:
     """Save in sRGB, in the format of the photo `like` that the image was made from."""
     target.parent.mkdir(parents=True, exist_ok=True)
-    image = in_srgb(image)
+    image = to_srgb(image)
     if profile := image.info.get("icc_profile"):
         options["icc_profile"] = profile
-    written = _written(like)
+    written = _written_format(like)
     if written == "JPEG":
         options |= {"quality": JPEG_QUALITY, "subsampling": 0}
     image.save(target, written, **options)
@@ -233,7 +233,7 @@ def link(source: Path, target: Path) -> None:
         shutil.copyfile(source, target)
 
 
-def _in_threads(
+def _do_for_all(
     work: Callable[[str], None], names: Sequence[str], title: str, remedy: str = "replace or remove them"
 ) -> None:
     """Do the work for all names. If it raises UserError for any, raise one UserError that lists them.

@@ -12,7 +12,7 @@ from PIL import Image
 
 from groundwork.files.color_tags import HDR, code_points
 from groundwork.files.image_files import HEIF_SUFFIXES, RAW_SUFFIXES, SUFFIXES, UNREADABLE, VIDEO_SUFFIXES, open_image
-from groundwork.files.plain_files import not_the_file, plain
+from groundwork.files.plain_files import describe_wrong_file, plain_path
 from groundwork.host.listing import some
 from scene.images.decode import picture_size
 from utils.system_utils import UserError
@@ -71,7 +71,7 @@ def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path]
     return Inputs(sorted(photos), unused)
 
 
-def unused_lines(unused: dict[str, str]) -> list[str]:
+def describe_unused(unused: dict[str, str]) -> list[str]:
     """One line for each reason, with names of files."""
     by_reason: dict[str, list[str]] = {}
     for name, reason in unused.items():
@@ -80,7 +80,7 @@ def unused_lines(unused: dict[str, str]) -> list[str]:
 
 
 class _Kind(NamedTuple):
-    """What a file is. format: of a photo, else ""; reason: why it cannot be used, or ""."""
+    """Kind of a file. format: of a photo, else ""; reason: why the file cannot be used, or ""."""
 
     format: str
     reason: str
@@ -91,7 +91,7 @@ def _kind(path: Path, thorough: bool) -> _Kind:
     if not path.is_file():
         return _Kind("unknown", _LINK)
     try:
-        with open(plain(path), "rb") as file:
+        with open(plain_path(path), "rb") as file:
             head = file.read(16)
             brand = head[8:12] if head[4:8] == b"ftyp" else b""
     except OSError as error:
@@ -107,18 +107,18 @@ def _kind(path: Path, thorough: bool) -> _Kind:
 
 
 def _heif_kind(path: Path, thorough: bool) -> _Kind:
-    """Of HEIC and AVIF, which are files of one container."""
-    if (points := code_points(plain(path), "HEIF")) and points[1] in HDR:
+    """Return the kind of a HEIC or AVIF file, which share a container format."""
+    if (points := code_points(plain_path(path), "HEIF")) and points[1] in HDR:
         return _Kind("HEIF", _HDR)
-    if not _is_whole(path):
+    if not _is_complete(path):
         return _Kind("HEIF", _DAMAGED)
-    readable = _register_heif()
+    readable = _enable_heif()
     kind = _picture_kind(path, thorough)
     return _Kind("HEIF", _INSTALL) if kind.reason and not readable else kind
 
 
-def _is_whole(path: Path) -> bool:
-    """Whether the boxes of an ISO file (ISO/IEC 14496-12) end where the file does."""
+def _is_complete(path: Path) -> bool:
+    """Tell if the boxes of an ISO file (ISO/IEC 14496-12) end where the file does."""
     place, size = 0, path.stat().st_size
     with open(path, "rb") as file:
         while place < size:
@@ -150,20 +150,20 @@ def _picture_kind(path: Path, thorough: bool) -> _Kind:
     except (*UNREADABLE, UserError):
         # Without `thorough`, the photos' own check says what is wrong with files that should be photos.
         if suffix in SUFFIXES:
-            other = not_the_file(path)
+            other = describe_wrong_file(path)
             return _Kind("unknown", (f"{other}: download it again" if other else _DAMAGED) if thorough else "")
         return _Kind("HEIF", _DAMAGED) if suffix in HEIF_SUFFIXES else _Kind("", "no picture")
     return _Kind("", "GIF, the format of animations") if kind == "GIF" else _Kind(kind, "")
 
 
 def _is_tga(path: Path) -> bool:
-    """Whether a file that can pass for a TGA is one: its header has no mark, but newer files have one at their end."""
+    """Tell if a file that Pillow reads as TGA is one: the header has no mark, but newer files have one at the end."""
     with open(path, "rb") as file:
         file.seek(max(path.stat().st_size - 26, 0))
         return path.suffix.lower() == ".tga" or file.read().startswith(b"TRUEVISION-XFILE")
 
 
-def _register_heif() -> bool:
+def _enable_heif() -> bool:
     """Let Pillow read HEIC; return whether it can."""
     if "HEIF" not in Image.OPEN:
         try:

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from applications.convert.inputs import Inputs, sort_inputs, unused_lines
+from applications.convert.inputs import Inputs, describe_unused, sort_inputs
 from groundwork.files.image_files import SUFFIXES, VIDEO_SUFFIXES
 from groundwork.files.similarity import FILE
 from groundwork.host.listing import some
@@ -61,7 +61,7 @@ def scene_folder(given: str, made: bool = False) -> Path:
 
 
 def take_photos_beside(layout: Layout, is_video: bool) -> None:
-    """Let photos that lie in the scene folder itself be the input, if `input` has no files; else name them.
+    """Take photos in the scene folder itself as input if `input` has no files; else say that they are not used.
 
     is_video: frames of a video will be written into `input`. UserError if `input` is no folder, or where nothing can be
     written.
@@ -96,7 +96,7 @@ def find_images(layout: Layout, skip_unreadable: bool = False, but: Iterable[Pat
     if len(found.photos) < FEWEST:
         raise UserError(
             f"{layout.input}: fewer than {FEWEST} readable photos ({len(found.photos)}); "
-            f"{'; '.join(['add more (20 to 200 with much overlap are usual)', *unused_lines(found.unused)])}"
+            f"{'; '.join(['add more (20 to 200 with much overlap are usual)', *describe_unused(found.unused)])}"
         )
     return found
 
@@ -126,7 +126,7 @@ def _is_image(path: Path) -> bool:
 
 
 def _has(path: Path, form: str | None) -> bool:
-    """Whether a file has a text by which those of convert.py are known."""
+    """Tell if a file contains a text that only files of convert.py have."""
     return form is not None and path.is_file() and form in path.read_text(encoding="utf-8", errors="replace")
 
 

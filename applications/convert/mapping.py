@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from applications.convert.checks import is_folded, is_only_turned, is_wrong
 from applications.convert.colmap import (
     ADDING,
     ALL_PAIRS,
@@ -19,10 +20,9 @@ from applications.convert.colmap import (
     Command,
     copy_database,
     count_rows,
-    names_in,
+    list_photos,
     worker_command,
 )
-from applications.convert.findings import is_folded, is_wrong, only_turned
 from groundwork.files.json_files import read_json, write_json
 from utils.system_utils import UserError
 
@@ -53,12 +53,12 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     ways = sorted(backend.ways, key=lambda way: (way == "free", few and way != "incremental"))
     for number, way in enumerate(ways):
         title = "Mapping" if not number else f"Mapping, try {number + 1}"
-        tried.append(_tried(backend, way, partial(place, title), run))
-        if agrees(tried[-1]) or only_turned(tried[-1]) or sum(map(is_folded, tried)) == _FOLDED:
+        tried.append(_try_way(backend, way, partial(place, title), run))
+        if is_accepted(tried[-1]) or is_only_turned(tried[-1]) or sum(map(is_folded, tried)) == _FOLDED:
             break
         if number + 1 < len(ways):
-            print(f"{_words(tried[-1])}; trying {name_of(ways[number + 1])}")
-    tried = sorted(tried, key=partial(_rank, tried), reverse=True)
+            print(f"{_describe_try(tried[-1])}; trying {way_name(ways[number + 1])}")
+    tried = sorted(tried, key=partial(_rank_key, tried), reverse=True)
     best = tried[0]
     if "failed" in best:
         if not any((layout.tried / best["way"]).glob("*/*")):
@@ -69,45 +69,45 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     if not is_folded(best):
         best["against"] = sorted({*best.get("against", ()), *best.get("alike", ())})
     if best.get("against") and backend.settings.mapper == ADDING:
-        old = set(names_in(layout.base_database))
+        old = set(list_photos(layout.base_database))
         best["against"] = [name for name in best["against"] if name not in old]
     if best.get("against") and not is_folded(best):
         model = str(layout.models / best["folder"])
         run([worker_command(layout, "keep", model=model, left_out=best["against"])], "Leaving out photos")
-        best |= {**_judgement(backend, layout.models, run), "against": best["against"]}  # of those that are left
+        best |= {**_judge_models(backend, layout.models, run), "against": best["against"]}  # of those that are left
     write_json(layout.judged, tried)
 
 
-def agrees(found: Mapping[str, Any]) -> bool:
-    """Whether a judged model is kept without another try."""
+def is_accepted(found: Mapping[str, Any]) -> bool:
+    """Tell if a judged model is good enough to be kept without another try."""
     return found.get("agreeing", 0) >= AGREEING * found.get("bound", 0) > 0 and not is_wrong(found)
 
 
-def _tried(
+def _try_way(
     backend: Backend, way: str, place: Callable[[list[Command]], None], run: Callable[..., None]
 ) -> dict[str, Any]:
-    """Map in one way, and judge what comes out. `failed` is a message, instead of what the judgement found."""
+    """Map in one way, and return the judgement of the models, or a message `failed` instead."""
     start, models = time.monotonic(), backend.layout.tried / way
     try:
         place(backend.mapping(way, models))
-        found = _judgement(backend, models, run)
+        found = _judge_models(backend, models, run)
     except UserError as error:
         found = {"failed": str(error)}
     return {"way": way, "seconds": round(time.monotonic() - start, 1)} | found
 
 
-def _judgement(backend: Backend, models: Path, run: Callable[..., None]) -> dict[str, Any]:
+def _judge_models(backend: Backend, models: Path, run: Callable[..., None]) -> dict[str, Any]:
     out = backend.layout.work / "judging.json"
     places = {"models": str(models), "calibrated": str(backend.layout.calibrated), "out": str(out)}
     run([worker_command(backend.layout, "judging", **places)], "Judging")
     return read_json(out)
 
 
-def _rank(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
-    """Return how good a model is among those that were tried, as a sort key.
+def _rank_key(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
+    """Return a sort key of how good a model is among those that were tried.
 
-    One that is far smaller than another may be right by chance. One that lacks photos of a folded model may be folded
-    where these would show it.
+    A model that is far smaller than another may be right by chance. A model that lacks photos of a folded one may be
+    folded, too, where only these photos would show it.
     """
     photos, most = found.get("photos", 0), max(one.get("photos", 0) for one in tried)
     folded = max((one["photos"] for one in tried if is_folded(one)), default=0)
@@ -115,16 +115,16 @@ def _rank(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple
     return photos > 0, is_sound, found.get("agreeing", 0), photos
 
 
-def name_of(way: str) -> str:
+def way_name(way: str) -> str:
     return _NAMES.get(way, f"{way} mapping")
 
 
-def _words(found: Mapping[str, Any]) -> str:
+def _describe_try(found: Mapping[str, Any]) -> str:
     if "failed" in found:
-        return f"{name_of(found['way'])} failed"
+        return f"{way_name(found['way'])} failed"
     if not found.get("photos"):
-        return f"{name_of(found['way'])} placed no photo"
+        return f"{way_name(found['way'])} placed no photo"
     if is_folded(found):
-        return f"{name_of(found['way'])} laid photos of different things upon each other"
+        return f"{way_name(found['way'])} laid photos of different things upon each other"
     agree = f"{found['agreeing']} of {found['bound']} photos"
-    return f"{name_of(found['way'])}: the matches of {agree} agree with their poses"
+    return f"{way_name(found['way'])}: the matches of {agree} agree with their poses"

@@ -1,4 +1,4 @@
-"""Where a converted scene is upright, and how large a metre is in it (convert.py --orient).
+"""Orientation of a converted scene: its vertical, and the length of a metre in it (convert.py --orient).
 
 The vertical is that of gravity in photos' EXIF data, else that of the photos' horizons and GPS, if they tell it. GPS
 gives the metre and the north. In the frame that results, y is down; with GPS, x is east and z is north.
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from applications.convert.georeference import Cameras, Fit, fit, is_level
+from applications.convert.georeference import Cameras, Fit, fit_level_frame, is_level
 from applications.convert.layout import Layout
 from groundwork.files.json_files import write_json
 from groundwork.files.similarity import PLACE, read_orientation
@@ -22,28 +22,30 @@ _SIZE = 0.1  # standard error of the scale, above which GPS does not tell it
 _AGREE = np.cos(np.radians(30))  # of gravity in a photo with that in most others, and with the vertical of horizons
 
 
-def orient(layout: Layout) -> None:
+def orient_scene(layout: Layout) -> None:
     """Write the similarity of a converted scene, `layout.orientation`; where no vertical is known, only the scale."""
     images = sorted(read_model(layout.sparse / "0").images, key=lambda image: image.name)
     turns = np.stack([image.qvec2rotmat().T for image in images])
     centers = np.stack([-turn @ image.tvec for turn, image in zip(turns, images, strict=True)])
-    photos = [read_place(_photo(layout, image.name)) for image in images]
-    middle, (reference, places) = np.median(centers, axis=0), _places(photos)
+    photos = [read_place(_source_photo(layout, image.name)) for image in images]
+    middle, (reference, places) = np.median(centers, axis=0), _locate_photos(photos)
     cameras = Cameras(turns, centers - middle, places)
-    vertical, found = _vertical(cameras, photos)
+    vertical, found = _find_vertical(cameras, photos)
     record: dict[str, Any] = {"unit": "scene", "gps_seen": int(np.isfinite(places[:, 0]).sum())} | vertical
     rotation, scale = found.rotation if vertical["vertical"] else np.eye(3), 1.0
     if _is_metric(found, cameras):
         scale = found.scale
         record |= {"unit": "metre", "scale_error": found.size, "gps_photos": int(found.fits.sum())}
-        record |= {"gps_error": _error(found, cameras)} | (_origin(found, reference) if vertical["vertical"] else {})
+        record |= {"gps_error": _gps_error(found, cameras)} | (
+            _locate_middle(found, reference) if vertical["vertical"] else {}
+        )
     translation = -scale * rotation @ middle
     record |= {"rotation": rotation.tolist(), "scale": scale, "translation": translation.tolist()}
     write_json(layout.orientation, record)
 
 
-def said_of(layout: Layout) -> list[str]:
-    """A line on what `orient` found; none if it was not asked for."""
+def describe_orientation(layout: Layout) -> list[str]:
+    """Say in a line what orientation `orient_scene` found; no line if --orient was not given."""
     if (record := read_orientation(layout.scene)) is None:
         return []
     if record["vertical"] is None:
@@ -65,19 +67,22 @@ def said_of(layout: Layout) -> list[str]:
     return [f"{level}; no scale: GPS of {seen} photos is too near to each other, or does not fit the poses"]
 
 
-def _vertical(cameras: Cameras, photos: Sequence[PhotoPlace]) -> tuple[dict[str, Any], Fit]:
-    """What is recorded of the vertical, and the fit to it.
+def _find_vertical(cameras: Cameras, photos: Sequence[PhotoPlace]) -> tuple[dict[str, Any], Fit]:
+    """Return the entries on the vertical for `layout.orientation`, and the fit with this vertical.
 
-    GPS takes part where neither gravity nor horizons tell it: heights of phones are away together, by many metres.
+    GPS counts only where neither gravity nor horizons tell the vertical: the heights of phones are all wrong by the
+    same many metres.
     """
-    level = fit(cameras._replace(places=np.full_like(cameras.places, np.nan)))
-    if measured := _measured_up(cameras.turns, level, photos):
+    level = fit_level_frame(cameras._replace(places=np.full_like(cameras.places, np.nan)))
+    if measured := _measure_up(cameras.turns, level, photos):
         up, text = measured
-        return {"vertical": text}, fit(cameras, up)
+        return {"vertical": text}, fit_level_frame(cameras, up)
     if is_level(level):
         error, up = float(np.degrees(level.tilt)), -level.rotation[1]
-        return {"vertical": f"the horizons of {len(photos)} photos", "vertical_error": error}, fit(cameras, up)
-    found = fit(cameras)
+        return {"vertical": f"the horizons of {len(photos)} photos", "vertical_error": error}, fit_level_frame(
+            cameras, up
+        )
+    found = fit_level_frame(cameras)
     if not (_is_metric(found, cameras) and is_level(found)):
         return {"vertical": None}, found
     horizons = f"the horizons of {len(photos)} photos and " if found.by_level < 2 * found.tilt else ""
@@ -86,14 +91,15 @@ def _vertical(cameras: Cameras, photos: Sequence[PhotoPlace]) -> tuple[dict[str,
 
 
 def _is_metric(found: Fit, cameras: Cameras) -> bool:
-    """Whether GPS tells the scale: of photos enough, of which most fit."""
+    """Tell if GPS gives the scale: enough photos have it, and most of these fit."""
     return found.size < _SIZE and found.fits.sum() >= max(FEWEST, np.isfinite(cameras.places[:, 0]).sum() / 2)
 
 
-def _places(photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, np.ndarray]:
-    """A place on Earth (degrees, degrees, m) amid the photos, and theirs (N,3), metres east, down and north of it.
+def _locate_photos(photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a place on Earth (degrees, degrees, m) amid the photos, and their places relative to it.
 
-    NaN where unknown. Heights that are all equal count as unknown: GPS does not measure such.
+    The places are (N, 3), metres east, down and north; NaN where unknown. Heights that are all equal count as unknown,
+    since GPS does not measure such heights.
     """
     gps = np.array([photo.gps or (np.nan,) * 3 for photo in photos])
     here = np.isfinite(gps[:, 0])
@@ -115,23 +121,23 @@ def _earth() -> Any:
     return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 
 
-def _error(found: Fit, cameras: Cameras) -> float:
-    """By how much the places that fit are away from their GPS along the ground, mean, in metres."""
+def _gps_error(found: Fit, cameras: Cameras) -> float:
+    """Return the mean distance along the ground, in metres, of the places that fit from their GPS."""
     away = found.scale * cameras.centers @ found.rotation.T + found.shift - cameras.places
     return float(np.hypot(away[found.fits, 0], away[found.fits, 2]).mean())
 
 
-def _origin(found: Fit, reference: np.ndarray) -> dict[str, float]:
-    """Where on Earth the middle of the photos is."""
+def _locate_middle(found: Fit, reference: np.ndarray) -> dict[str, float]:
+    """Return the place on Earth of the middle of the photos."""
     east, down, north = found.shift
     place = _earth().enu_to_ellipsoid(np.array([[east, north, -down]]), *reference)[0]
     return dict(zip(PLACE, place.tolist(), strict=True))
 
 
-def _measured_up(turns: np.ndarray, level: Fit, photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, str] | None:
-    """Up by gravity of the photos that have it, and what is said of it.
+def _measure_up(turns: np.ndarray, level: Fit, photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, str] | None:
+    """Return the upward direction (3,) by gravity in the photos' EXIF data, and a text on its source.
 
-    None if none has, or if most contradict each other, or the known vertical of all.
+    None if no photo has gravity, or if most photos contradict each other or the known vertical.
     """
     having = [number for number, photo in enumerate(photos) if photo.down is not None]
     if not having:
@@ -145,8 +151,8 @@ def _measured_up(turns: np.ndarray, level: Fit, photos: Sequence[PhotoPlace]) ->
     return up / np.linalg.norm(up), f"gravity of {len(ups)} photos"
 
 
-def _photo(layout: Layout, name: str) -> Path:
-    """The file that a photo of the model was made from, which has all of its EXIF data."""
+def _source_photo(layout: Layout, name: str) -> Path:
+    """Return the file that a photo of the model was made from, which still has all EXIF data."""
     kept = layout.input / name
     changed = kept.with_name(kept.stem)  # without the suffix that was appended for COLMAP
     return next((path for path in (kept, changed) if path.is_file()), layout.images / name)

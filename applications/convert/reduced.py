@@ -27,7 +27,7 @@ _THREADS = 16  # each may hold a photo of 50 megapixels
 _ROUNDED = 1.5  # pixels by which a smaller copy's side may differ from the photo's proportions
 
 
-def longest_side(count: int) -> int:
+def choose_longest_side(count: int) -> int:
     """Pixels of the longer side on which features of so many photos are found."""
     return LONGEST_OF_FEW if count <= FEW else LONGEST
 
@@ -75,7 +75,7 @@ def _refuse_other_shape(image: pycolmap.Image, width: int, height: int) -> None:
         sys.exit(f"the photo {image.name} has {width} x {height} pixels, but its camera in the model {of_camera}")
 
 
-def enlarged(path: str, photos: Path) -> pycolmap.Reconstruction:
+def read_enlarged(path: str, photos: Path) -> pycolmap.Reconstruction:
     """Read a model, and bring its cameras and image points to the size of its photos."""
     model = pycolmap.Reconstruction(path)
     sizes: dict[int, tuple[int, int]] = {}

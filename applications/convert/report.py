@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
-from applications.convert.findings import unusable
+from applications.convert.checks import why_unusable
 from applications.convert.layout import Layout
 from groundwork.files.json_files import read_json, write_json
 from utils.system_utils import UserError
@@ -25,7 +25,7 @@ class Model(NamedTuple):
 
 
 def read_tried(layout: Layout) -> list[dict[str, Any]]:
-    """What mapping.py found of each way, the chosen one first; nothing where it did not judge."""
+    """Read mapping.py's judgement of each way, the chosen one first; an empty list where it did not judge."""
     return read_json(layout.judged) if layout.judged.is_file() else []
 
 
@@ -44,7 +44,7 @@ def read_survey(layout: Layout, tried: Sequence[Mapping[str, Any]]) -> list[Mode
     )
 
 
-def summary(report: dict[str, Any]) -> str:
+def summarise(report: dict[str, Any]) -> str:
     """Summarise the contents of convert_report.json in one line."""
     return (
         f"{report['registered']} of {report['photos']} photos placed; {report['points']} points, each in "
@@ -53,7 +53,7 @@ def summary(report: dict[str, Any]) -> str:
     )
 
 
-def lens_words(report: dict[str, Any]) -> str:
+def describe_lenses(report: dict[str, Any]) -> str:
     """Say in one line which photos convert_report.json is about: those of the lenses, or undistorted ones."""
     if report["lenses"] == "undistort":
         return "the scene has undistorted photos, with pinhole cameras"
@@ -77,10 +77,10 @@ def write_report(
         "points": chosen.points,
         "registered": len(chosen.registered),
     }
-    write_json(path, {**content, "unusable": unusable(content)})
+    write_json(path, {**content, "unusable": why_unusable(content)})
 
 
-def report_inputs(path: Path, **inputs: Any) -> dict[str, Any]:
+def record_inputs(path: Path, **inputs: Any) -> dict[str, Any]:
     """Return the contents of convert_report.json with entries about `input`, which may change without a new model."""
     content = read_json(path)
     if content != (whole := {**content, **inputs}):

@@ -13,7 +13,7 @@ import numpy as np
 from PIL import Image
 from scipy.ndimage import binary_dilation
 
-from applications.convert.images import upright_size
+from applications.convert.images import read_upright_size
 from applications.convert.inputs import sort_inputs
 from scene.checks.photos import Photo, find_shared, looks_at
 from scene.checks.shared_pixels import BORDER
@@ -24,7 +24,7 @@ def write_shared_masks(photos: Path, masks: Path) -> int:
     """Write the masks into a folder, and return their number. UserError if there is nothing to mask."""
     names = sort_inputs(photos, skip_unreadable=True).photos if photos.is_dir() else []
     shared = find_shared(looks_at([Photo(name, photos / name) for name in names], len(names)))
-    sizes = {name: upright_size(photos / name) for name in names}
+    sizes = {name: read_upright_size(photos / name) for name in names}
     named = [name for name in names if sizes[name] in shared]
     if not named:
         raise UserError(f"no pixels that nearly all photos in {photos} share were found; nothing is written")

@@ -16,17 +16,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from applications.convert import cameras, colmap, images, report, video
-from applications.convert.adding import base_state
+from applications.convert.adding import read_base_state
+from applications.convert.checks import check_given_poses, check_reconstruction, check_shared_cameras, refuse_unplaced
 from applications.convert.colmap import Backend, Settings, worker_command
 from applications.convert.dense_points import add_points
-from applications.convert.findings import of_given_poses, of_model, of_shared_cameras, refuse_nothing
-from applications.convert.given_poses import files_of, given_names, posed_photos, write_given
+from applications.convert.given_poses import find_posed_photos, list_given, list_pose_files, write_given
 from applications.convert.layout import Layout, image_names
 from applications.convert.mapping import map_photos
-from applications.convert.orienting import orient
+from applications.convert.orienting import orient_scene
 from applications.convert.programs import run_programs
 from groundwork.files.json_files import read_json, write_json
-from scene.checks.conversion import state_of
+from scene.checks.conversion import file_state
 from utils.system_utils import UserError, mkdir_p
 
 FACTORS = (2, 4, 8)  # of --resize
@@ -78,15 +78,15 @@ class StageRecord:
         self._record[name] = {"made_from": content, "done": True}
 
     def begun(self, name: str) -> bool:
-        """Whether this stage was ever begun in this folder."""
+        """Tell if a stage was ever begun in this folder."""
         return name in self._record
 
     def finished(self, name: str) -> bool:
-        """Whether this stage was finished."""
+        """Tell if a stage was finished."""
         return self.begun(name) and self._record[name]["done"]
 
     def interrupted(self, name: str) -> bool:
-        """Whether this stage was begun and not finished."""
+        """Tell if a stage was begun and not finished."""
         return self.begun(name) and not self.finished(name)
 
     def run(self, stages: list[Stage]) -> list[str]:
@@ -121,7 +121,7 @@ class StageRecord:
         return kept
 
     def seconds(self) -> dict[str, float]:
-        """How long each finished stage took when it was last done, in order."""
+        """Return the seconds that each finished stage took when it was last done, in order."""
         return {name: entry["seconds"] for name, entry in self._record.items() if "seconds" in entry and entry["done"]}
 
     def _save(self) -> None:
@@ -137,7 +137,7 @@ def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
 
     return Stage(
         "video",
-        [[state_of(path) for path in videos], count],
+        [[file_state(path) for path in videos], count],
         reset=partial(video.remove_frames, layout),
         work=partial(video.extract_videos, layout, videos, count),
         check=check,
@@ -146,9 +146,9 @@ def video_stage(layout: Layout, videos: Sequence[Path], count: int) -> Stage:
 
 def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     """Make the stage that puts upright photos and masks into the work folder."""
-    made_from = [[name, state_of(layout.input / name)] for name in names]
+    made_from = [[name, file_state(layout.input / name)] for name in names]
     if masks:
-        made_from.append([[str(path), state_of(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
+        made_from.append([[str(path), file_state(path)] for path in sorted(masks.rglob("*")) if path.is_file()])
 
     return Stage(
         "photos",
@@ -163,10 +163,10 @@ def poses_stage(layout: Layout, source: Path) -> Stage:
     """Make the stage that finds the given poses and cameras of the photos."""
     return Stage(
         "poses",
-        [[str(path), state_of(path)] for path in files_of(source)],
+        [[str(path), file_state(path)] for path in list_pose_files(source)],
         reset=lambda: _remove(layout.given),
         work=lambda: write_given(layout, source),
-        check=lambda: posed_photos(layout, source) and None,
+        check=lambda: find_posed_photos(layout, source) and None,
     )
 
 
@@ -182,10 +182,10 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
 
     def features() -> None:
         if settings.mapper == colmap.GIVEN:
-            names = [given_names(layout)]
+            names = [list_given(layout)]
         else:
-            groups = cameras.group(layout.prepared, image_names(layout.prepared), settings.cameras)
-            print(cameras.listing(groups))
+            groups = cameras.group_photos(layout.prepared, image_names(layout.prepared), settings.cameras)
+            print(cameras.describe_groups(groups))
             names = [group.names for group in groups]
         if settings.mapper == colmap.ADDING:
             colmap.copy_database(layout.base_database, layout.database)
@@ -200,13 +200,13 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
 
     def mapping() -> None:
         def place(title: str, commands: list[colmap.Command]) -> None:
-            run(commands, title, rows("images"), _registered_since(layout.log))
+            run(commands, title, rows("images"), _count_registered_since(layout.log))
 
         map_photos(backend, lambda commands, title: run(commands, title, 1, lambda: 0), place)
 
     def check_sizes() -> None:
         """UserError for photos that are no panoramas, if they are said to be."""
-        wrong = [names[0] for (w, h), names in images.sizes(layout).items() if w != 2 * h]
+        wrong = [names[0] for (w, h), names in images.group_by_size(layout).items() if w != 2 * h]
         if settings.camera == colmap.PANORAMA and wrong:
             raise UserError(
                 f"{wrong[0]} is not twice as wide as high, as panoramas of 360 by 180 degrees are; remove such photos, "
@@ -217,7 +217,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     files = [layout.database.with_name(layout.database.name + end) for end in ("", "-wal", "-shm", "-journal")]
     features_from = [backend.identity, settings.camera, settings.cameras, settings.max_num_features, settings.no_gpu]
     if settings.mapper == colmap.ADDING:
-        features_from.append(base_state(layout))
+        features_from.append(read_base_state(layout))
     return [
         Stage("features", features_from, lambda: _remove(*files, layout.small), features, check=check_sizes),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
@@ -240,12 +240,12 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         tried = report.read_tried(layout) if made_from is None else []  # else a model was made elsewhere
         models = report.read_survey(layout, tried)
         names = image_names(root)
-        matches = colmap.partners(layout.database)
-        refuse_nothing(models, names, matches, settings.matcher)
-        chosen, lenses, limit = models[0], cameras.lenses(root, names), settings.max_num_features
-        at_limit = limit if colmap.most_features(layout.database) >= limit else 0
+        matches = colmap.count_partners(layout.database)
+        refuse_unplaced(models, names, matches, settings.matcher)
+        chosen, lenses, limit = models[0], cameras.read_lenses(root, names), settings.max_num_features
+        at_limit = limit if colmap.count_most_features(layout.database) >= limit else 0
         given = settings.mapper == colmap.GIVEN
-        found = [*of_given_poses(chosen, names)] if given else []  # UserError before anything is replaced
+        found = [*check_given_poses(chosen, names)] if given else []  # UserError before anything is replaced
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
         paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
         job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
@@ -266,14 +266,15 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         if same := images.find_shared_pixels(root, names, masks):  # which other weaknesses come from
             found += same
         elif not given:
-            found += of_model(models, names, matches, settings.matcher, at_limit, tried, more, settings.cameras)
-            found += of_shared_cameras(chosen.cameras, lenses, settings.cameras, video.taken_frames(layout))
-        later = [path for name, paths in _written_by(layout).items() if record.begun(name) for path in paths]
+            found += check_reconstruction(
+                models, names, matches, settings.matcher, at_limit, tried, more, settings.cameras
+            )
+            found += check_shared_cameras(chosen.cameras, lenses, settings.cameras, video.list_taken_frames(layout))
+        later = [path for name, paths in _list_outputs(layout).items() if record.begun(name) for path in paths]
         whole = layout.undistorted / "whole"
         mkdir_p(whole)
         (layout.undistorted / "sparse").rename(whole / "0")
-        described = cameras.described(chosen.cameras, lenses)
-        made_of = {**made, "advice": [*map(str, found)], "cameras": described}
+        made_of = {**made, "advice": [*map(str, found)], "cameras": cameras.describe_cameras(chosen.cameras, lenses)}
         made_of |= {"lenses": "native" if native else "undistort", "more_points": more, "tried": tried}
         # `sparse` goes first and comes last: what has one has the photos, too, and the report with its verdict.
         _remove(layout.sparse, layout.images, layout.report, *later)
@@ -298,38 +299,38 @@ def resize_stage(layout: Layout) -> Stage:
     return Stage("resize", list(FACTORS), lambda: None, work)
 
 
-def wanted_stages(layout: Layout, record: StageRecord, args: argparse.Namespace) -> list[Stage]:
-    """Make the stages, after all others, of what a user asks for, or, with --add, has asked for before.
+def requested_stages(layout: Layout, record: StageRecord, args: argparse.Namespace) -> list[Stage]:
+    """Make the optional stages, the last ones, that a user asks for, or with --add has asked for before.
 
-    UserError for what they would replace, if no earlier run began them.
+    UserError for files that these stages would replace, if no earlier run wrote the files.
     """
     last = resize_stage(layout), orient_stage(layout)
     wanted = [stage for stage in last if getattr(args, stage.name) or (args.add and record.begun(stage.name))]
     for name in (stage.name for stage in wanted if not record.begun(stage.name)):
-        if there := [path for path in _written_by(layout)[name] if path.exists()]:
+        if there := [path for path in _list_outputs(layout)[name] if path.exists()]:
             raise UserError(f"convert.py did not make {there[0]}, and --{name} would replace it; move it away")
     return wanted
 
 
-def _written_by(layout: Layout) -> dict[str, list[Path]]:
-    """What the stages that a user asks for write into the scene, by their names."""
+def _list_outputs(layout: Layout) -> dict[str, list[Path]]:
+    """Return the paths that the optional stages write into the scene, by the stages' names."""
     return {"resize": [*map(layout.resized, FACTORS)], "orient": [layout.orientation]}
 
 
 def orient_stage(layout: Layout) -> Stage:
     """Make the stage that finds where the scene is upright."""
-    return Stage("orient", 1, lambda: _remove(layout.orientation), lambda: orient(layout))
+    return Stage("orient", 1, lambda: _remove(layout.orientation), lambda: orient_scene(layout))
 
 
-def model_state(layout: Layout) -> list[Any]:
+def read_model_state(layout: Layout) -> list[Any]:
     """Describe the files of a model made elsewhere, so that changes show. UserError if there is no model."""
     files = sorted(layout.models.rglob("*.*")) if layout.models.is_dir() else []
     if not files:
         raise UserError(f"--skip_matching needs a COLMAP model in {layout.models}; omit the option to make one")
-    return [[str(path.relative_to(layout.models)), *state_of(path)] for path in files]
+    return [[str(path.relative_to(layout.models)), *file_state(path)] for path in files]
 
 
-def _registered_since(log: Path) -> Callable[[], int]:
+def _count_registered_since(log: Path) -> Callable[[], int]:
     """Return a function that counts the photos placed since now, according to the mapper's log."""
     position = log.stat().st_size if log.is_file() else 0
     most = 0

@@ -35,7 +35,7 @@ PATTERN = "frame_[0-9][0-9][0-9][0-9][0-9].jpg"  # of a video's frames
 _STREAM = re.compile(r"^ *Stream #0:(\d+).*?: Video: (?!.*\(attached pic\))(.*?), (.*?), (\d+)x(\d+)\b", re.MULTILINE)
 _HALF = 2.5  # width by height, from which on a stream is half of a panorama; a lens has 1 to 2
 _NAME = re.compile(r"([^/.][^/]*/)?frame_\d{5,}\.jpg")  # below `input`, which a record of others may not leave
-# Difference, as of `_differ`, between frames that follow each other: photos of fox_raw, monstree_raw and bonsai_full
+# Difference between frames that follow each other (`_is_different`): photos of fox_raw, monstree_raw and bonsai_full
 # reach it when they move by 0.3 to 0.6 % of their width; strong noise (6 of 255 levels) reaches 0.03.
 LEAST = 0.1
 _SIDE = 48  # of the small pictures that are compared
@@ -57,7 +57,7 @@ FRAMES_MISSING = "an earlier run ended before it had all frames of its video; pa
 
 
 class Stream(NamedTuple):
-    """A stream of a video, if that has several: options that choose it, what differs in the header, what to say."""
+    """A stream of a video with several: ffmpeg's options for it, differences in its header, and a text for the user."""
 
     options: list[str]
     header: dict[str, str]
@@ -90,7 +90,7 @@ def find_streams(video: Path) -> list[Stream]:
     return [Stream(["-map", f"0:{k}"], {"codec": codec, "pix_fmt": kind}, [said]) for k, codec, kind, *_ in taken]
 
 
-def _pieces(layout: Layout, videos: Sequence[Path]) -> list[tuple[Path, Stream, Path]]:
+def _list_streams(layout: Layout, videos: Sequence[Path]) -> list[tuple[Path, Stream, Path]]:
     """Return each video with each stream that is taken, and the folder of its frames."""
     pieces = [(video, stream) for video in videos for stream in find_streams(video)]
     folders = frame_folders(layout, [video for video, _ in pieces])
@@ -126,15 +126,15 @@ def frame_folders(layout: Layout, videos: Sequence[Path]) -> list[Path]:
     ]
 
 
-def taken_frames(layout: Layout) -> set[str]:
+def list_taken_frames(layout: Layout) -> set[str]:
     """Names, below `input`, of the frames that an earlier run wrote or was about to write."""
-    return {name for entry in _record(layout) for name in entry["names"]}
+    return {name for entry in _read_record(layout) for name in entry["names"]}
 
 
 def refuse_foreign_frames(layout: Layout, videos: Sequence[Path]) -> None:
     """Raise UserError if a file that is no frame of an earlier run has a name that frames may get."""
-    ours = {layout.input / name for name in taken_frames(layout)}
-    for video, _, folder in _pieces(layout, videos):
+    ours = {layout.input / name for name in list_taken_frames(layout)}
+    for video, _, folder in _list_streams(layout, videos):
         foreign = [path for path in sorted(folder.glob(PATTERN)) if not (path in ours and is_ours(path))]
         if foreign:
             raise UserError(
@@ -145,7 +145,7 @@ def refuse_foreign_frames(layout: Layout, videos: Sequence[Path]) -> None:
 
 def remove_frames(layout: Layout) -> None:
     """Remove the frames of an earlier run, but for those that were changed since."""
-    for path in (layout.input / name for name in taken_frames(layout)):
+    for path in (layout.input / name for name in list_taken_frames(layout)):
         if is_ours(path):
             path.unlink()
     layout.frames.unlink(missing_ok=True)
@@ -153,21 +153,21 @@ def remove_frames(layout: Layout) -> None:
 
 def extract_videos(layout: Layout, videos: Sequence[Path], count: int) -> None:
     """Write at most `count` frames of each video below `input`, and `frames.json`, which says what they are."""
-    for video, stream, folder in _pieces(layout, videos):
+    for video, stream, folder in _list_streams(layout, videos):
         mkdir_p(folder)
         extract_frames(layout, video, folder, count, stream)
 
 
-def report_entries(layout: Layout) -> list[dict[str, Any]]:
-    """For each video of `frames.json` its name, how many frames it has, were asked for and taken, and its HDR."""
+def list_report_entries(layout: Layout) -> list[dict[str, Any]]:
+    """List for each video of `frames.json` its name, its frames, those asked for and taken, and its HDR."""
     kept = ("video", "frames", "asked", "hdr")
-    return [{"taken": len(entry["names"]), **{key: entry[key] for key in kept}} for entry in _record(layout)]
+    return [{"taken": len(entry["names"]), **{key: entry[key] for key in kept}} for entry in _read_record(layout)]
 
 
-def video_lines(layout: Layout) -> list[str]:
-    """What a user should know about the frames: how many were taken, why fewer than asked, and what scores tell."""
+def describe_videos(layout: Layout) -> list[str]:
+    """Describe the frames, a line for each video: number taken, why fewer than asked, and conversions."""
     lines = []
-    for entry in _record(layout):
+    for entry in _read_record(layout):
         taken, text = len(entry["names"]), f"{entry['video']}: {len(entry['names'])} of {entry['frames']} frames taken"
         if taken < entry["asked"]:
             all_taken = taken == entry["frames"]
@@ -177,7 +177,7 @@ def video_lines(layout: Layout) -> list[str]:
     return lines
 
 
-def _record(layout: Layout) -> list[dict[str, Any]]:
+def _read_record(layout: Layout) -> list[dict[str, Any]]:
     try:
         record = read_json(layout.frames) if layout.frames.is_file() else []
         for entry in record:
@@ -200,7 +200,7 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
         told = next(decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=stream.options))
         header = told | stream.header
         colours = header["pix_fmt"]
-        fields = _of_fields(colours, header.get("codec", ""))
+        fields = _deinterlace_filter(colours, header.get("codec", ""))
         options = [*stream.options, "-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
         grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
         reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options, **grey)
@@ -216,7 +216,7 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
             _warn_if_cut(decoder, video, header["duration"], stream.options)
         chosen = choose_frames(sharp, np.stack(small), count)
         hdr = next((name for tag, name in _HDR.items() if tag in colours), "")
-        filters = _filters(decoder, video, colours, bool(hdr))
+        filters = _sdr_filters(decoder, video, colours, bool(hdr))
         paths = [folder / f"frame_{number + 1:05d}.jpg" for number in range(len(chosen))]
         names = [path.relative_to(layout.input).as_posix() for path in paths]
         entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
@@ -224,8 +224,8 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
         entry["made"] = stream.said + ["it is interlaced, so one of two fields makes each frame"] * bool(fields)
         if (width, height) != tuple(header["size"]):
             entry["made"].append(f"its pixels are not square, so {stored} became {width} x {height}")
-        write_json(layout.frames, [*_record(layout), entry])
-        for path, frame in zip(paths, _read(decoder, video, chosen, stream, fields, filters), strict=True):
+        write_json(layout.frames, [*_read_record(layout), entry])
+        for path, frame in zip(paths, _read_frames(decoder, video, chosen, stream, fields, filters), strict=True):
             write_picture(path, Image.fromarray(frame), quality=JPEG_QUALITY, subsampling=0)
     except (OSError, RuntimeError, ValueError, StopIteration) as error:
         reason = str(error).strip().splitlines()
@@ -279,7 +279,7 @@ def choose_frames(sharp: Sequence[float], small: np.ndarray, count: int) -> list
     """
     steps, first = np.zeros(len(small), dtype=np.int64), small[0]
     for number, picture in enumerate(small[1:], 1):
-        moved = _differ(picture, first)
+        moved = _is_different(picture, first)
         steps[number] = steps[number - 1] + moved
         first = picture if moved else first
     total = int(steps[-1]) + 1
@@ -287,7 +287,7 @@ def choose_frames(sharp: Sequence[float], small: np.ndarray, count: int) -> list
     chosen: list[int] = []
     for part in range(min(count, total)):
         there = np.flatnonzero(parts == part)
-        new = [number for number in there if not chosen or _differ(small[number], small[chosen[-1]])]
+        new = [number for number in there if not chosen or _is_different(small[number], small[chosen[-1]])]
         if new:
             chosen.append(int(max(new, key=lambda number: sharp[number])))
     return chosen
@@ -306,12 +306,12 @@ def small_picture(frame: np.ndarray) -> np.ndarray:
     return ((picture - picture.mean()) / max(float(picture.std()), 1.0)).astype(np.float16)
 
 
-def _differ(one: np.ndarray, other: np.ndarray) -> bool:
-    """Whether the root mean square of the difference of two small pictures is LEAST or more."""
+def _is_different(one: np.ndarray, other: np.ndarray) -> bool:
+    """Tell if the root mean square of the difference of two small pictures is LEAST or more."""
     return float(np.sqrt(np.square(one.astype(np.float32) - other.astype(np.float32)).mean())) >= LEAST
 
 
-def _filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
+def _sdr_filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
     """ffmpeg's filters from the colours of a stream, as its header has them, to BT.709; none if it has those already.
 
     UserError if this ffmpeg lacks the filters, or if the stream does not name its transfer function.
@@ -336,13 +336,17 @@ def _filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
     return [*known, _LINEAR, *([_COMPRESSED] if hdr else []), _DISPLAY]
 
 
-def _any(numbers: Sequence[int]) -> str:
+def _select_expression(numbers: Sequence[int]) -> str:
     """ffmpeg's expression for frames of these numbers: a balanced tree, as ffmpeg 8 refuses sums of over 100 terms."""
     half = len(numbers) // 2
-    return f"({_any(numbers[:half])}+{_any(numbers[half:])})" if half else rf"eq(n\,{numbers[0]})"
+    return (
+        f"({_select_expression(numbers[:half])}+{_select_expression(numbers[half:])})"
+        if half
+        else rf"eq(n\,{numbers[0]})"
+    )
 
 
-def _of_fields(colours: str, codec: str = "") -> list[str]:
+def _deinterlace_filter(colours: str, codec: str = "") -> list[str]:
     """ffmpeg's filter that makes frames of the fields of an interlaced video; none of any other video."""
     found = re.search(r"\b(top|bottom) (coded )?first\b", colours)
     # A header "(tv, top coded first (swapped))" ends at its comma here.
@@ -353,11 +357,11 @@ def _of_fields(colours: str, codec: str = "") -> list[str]:
     return [f"bwdif=mode=send_frame:parity={parity}:deint=all"]
 
 
-def _read(
+def _read_frames(
     decoder: Any, video: Path, numbers: Sequence[int], stream: Stream, before: list[str], filters: list[str]
 ) -> Iterator[np.ndarray]:
     """Yield the frames (H, W, 3) uint8 of these numbers. before: filters that need the frames around them."""
-    chain = ",".join([*before, f"select={_any(numbers)}", _SQUARE, *filters])
+    chain = ",".join([*before, f"select={_select_expression(numbers)}", _SQUARE, *filters])
     options = [*stream.options, "-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
     reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options)
     width, height = next(reader)["size"]

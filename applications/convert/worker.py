@@ -22,7 +22,7 @@ import pycolmap
 
 from applications.convert import pairing
 from applications.convert.database import opened
-from applications.convert.reduced import ABOUT, ENLARGED, FEW, enlarged, longest_side, reduce_photos
+from applications.convert.reduced import ABOUT, ENLARGED, FEW, choose_longest_side, read_enlarged, reduce_photos
 from scene.agreement import judge
 
 SEED = 0
@@ -40,7 +40,7 @@ FISHEYE_ANGLE = 2.6  # radians along the longer side, 150 degrees: first guess f
 def features(job: dict[str, Any]) -> None:
     """Write SIFT features of groups of photos into a database, with one camera per group, or with given cameras.
 
-    Photos that the database has stay; what is in a group with some of them takes their camera.
+    Photos that the database has already stay; new photos of their group get the same camera.
     """
     reader = pycolmap.ImageReaderOptions()
     if job["masks"]:
@@ -57,7 +57,7 @@ def features(job: dict[str, Any]) -> None:
         # Import the photos first, in order: threads would number them in the order in which they happen to finish. The
         # camera of a group begins with the focal length that the EXIF data of its first photo tell, if they do.
         known = _cameras_by_name(Path(job["base"]).with_name("database.db")) if job["mapper"] == "adding" else {}
-        longest = longest_side(sum(map(len, job["groups"])))
+        longest = choose_longest_side(sum(map(len, job["groups"])))
         for names in job["groups"]:
             reader.existing_camera_id = next((known[name][0] for name in names if name in known), -1)
             if new := [name for name in names if name not in known]:
@@ -86,11 +86,11 @@ def _refuse_strangers(job: dict[str, Any]) -> None:
 
 
 def _by_octave(path: str) -> dict[int, list[str]]:
-    """Photos of a database by SIFT's first octave, which is -1 where they are small and enlarged twofold."""
+    """List the photos of a database by SIFT's first octave: -1 for small photos, which SIFT enlarges twofold."""
     database = opened(path)
     images, sizes = database.read_all_images(), {one.camera_id: one for one in database.read_all_cameras()}
     database.close()
-    longest = ABOUT * max(longest_side(len(images)), ENLARGED)
+    longest = ABOUT * max(choose_longest_side(len(images)), ENLARGED)
     found: dict[int, list[str]] = {}
     for image in images:
         camera = sizes[image.camera_id]
@@ -115,8 +115,8 @@ def matching(job: dict[str, Any]) -> None:
     verification.ransac.random_seed = SEED
     how = {"verification_options": verification, "device": _device(job)}
     if job["matcher"] == "auto":
-        for pairs in pairing.rounds(path, job["all_of"]):
-            pairing.match(path, pairs, Path(path).with_name("pairs.txt"), **how)
+        for pairs in pairing.plan_rounds(path, job["all_of"]):
+            pairing.match_pairs(path, pairs, Path(path).with_name("pairs.txt"), **how)
         return
     match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
     match(path, **how)
@@ -172,7 +172,7 @@ def _photos(job: dict[str, Any]) -> str:
 
 
 def _is_dense(path: str) -> bool:
-    """Whether there are many photos with many matches, of which some are enough."""
+    """Tell if there are many photos with many matches, of which some are enough."""
     database = opened(path)
     count, matches = database.num_images(), database.num_inlier_matches()
     database.close()
@@ -278,7 +278,7 @@ def _models(path: str, photos: Path | None = None) -> list[tuple[str, pycolmap.R
     found = []
     for folder in sorted(Path(path).iterdir()):
         try:
-            model = enlarged(str(folder), photos) if photos else pycolmap.Reconstruction(str(folder))
+            model = read_enlarged(str(folder), photos) if photos else pycolmap.Reconstruction(str(folder))
             found.append((folder.name, model))
         except (ValueError, RuntimeError, IndexError):
             continue  # no model, or one whose writing was interrupted
@@ -352,7 +352,7 @@ def undistort(job: dict[str, Any]) -> None:
 
     capture: of _write_capture.
     """
-    model, out = enlarged(job["model"], Path(job["images"])), Path(job["out"])
+    model, out = read_enlarged(job["model"], Path(job["images"])), Path(job["out"])
     _write_capture(model, job["capture"])
     if job["native"]:
         for name in [model.images[i].name for i in model.reg_image_ids()]:

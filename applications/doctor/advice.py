@@ -20,7 +20,7 @@ from arguments import ModelParams, read_training_options
 from groundwork.files.json_files import write_json
 from groundwork.finding import Finding, note
 from groundwork.ranks.ranks import ranks
-from scene.checks.scene import findings, tell
+from scene.checks.scene import findings, report
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
@@ -51,14 +51,14 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = Scene(small, GaussianModel(0), shuffle=False, start=False)
     if trains:
-        tell(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
+        report(findings(scene.info, dataset, scene.halves), dataset.source_path, quiet=not warns)
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     if any(tracks):
-        yield from _of_tracks(scene, tracks)
+        yield from _check_distances(scene, tracks)
     for advise_part in tools("advise"):
         yield from advise_part(scene, tracks)
     if trains:
-        yield from _of_short_training(dataset)
+        yield from _train_shortly(dataset)
 
 
 def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: Sequence[str]) -> list[str]:
@@ -77,7 +77,7 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     for advice in advise(dataset, warns=args.advise):  # a training that follows prints them itself
         print(advice, flush=True)
         found.append(advice)
-    found = [_taken(advice, args, given) for advice in found]
+    found = [_filter_advice(advice, args, given) for advice in found]
     if written:
         write_json(
             Path(dataset.model_path) / ADVICE, [{"text": advice.text, "options": advice.options} for advice in found]
@@ -88,8 +88,8 @@ def asked_options(dataset: argparse.Namespace, args: argparse.Namespace, given: 
     return words
 
 
-def _taken(advice: Finding, args: argparse.Namespace, given: Sequence[str]) -> Finding:
-    """The advice, without its options where one of them is given, or where they do not go with given ones."""
+def _filter_advice(advice: Finding, args: argparse.Namespace, given: Sequence[str]) -> Finding:
+    """Return the advice, without its options where one of them is given or where they contradict given ones."""
     words = advice.options.split()
     against = None
     if words:
@@ -109,7 +109,7 @@ def check_options(source: str, images: str, model: str | None = None) -> list[Fi
 
     images: as train.py's -i. model: folder of a model; what it was trained with is not asked for.
     """
-    then = _trained_with(model) if model else []
+    then = _read_trained_options(model) if model else []
     dataset = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=source, images=images))
     dataset.lenses = "native"
     try:
@@ -119,7 +119,7 @@ def check_options(source: str, images: str, model: str | None = None) -> list[Fi
     return [advice for advice in found if advice.options and advice.options.split()[0] not in then]
 
 
-def _trained_with(model: str) -> list[str]:
+def _read_trained_options(model: str) -> list[str]:
     """Options that a training has switched on, as words of a command line; none where no model is."""
     try:
         return [f"--{name}" for name, value in read_training_options(model).items() if value not in _OFF]
@@ -127,15 +127,18 @@ def _trained_with(model: str) -> list[str]:
         return []
 
 
-def _of_tracks(scene: Scene, tracks: list[Track | None]) -> Iterator[Finding]:
-    """What the tracks of structure from motion say."""
-    ratio = distances(scene.info.train_cameras, tracks)
+def _check_distances(scene: Scene, tracks: list[Track | None]) -> Iterator[Finding]:
+    """Advise by the tracks of structure from motion: options that pay where photos have unlike distances."""
+    ratio = measure_distance_ratio(scene.info.train_cameras, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
     yield note(text, "--antialiasing" if ratio > DISTANCES else "")
 
 
-def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
-    """The median over points of the largest over the smallest distance in focal lengths, of the photos that see it."""
+def measure_distance_ratio(views: list[CameraInfo], tracks: list[Track | None]) -> float:
+    """Return the largest over the smallest distance of a point from the photos that see it, the median over points.
+
+    Distances are in focal lengths.
+    """
     seen = [(track.ranks, np.linalg.norm(track.points @ view.R + view.T, axis=1) / view.fx)
             for view, track in zip(views, tracks, strict=True) if track is not None]  # fmt: skip
     points, away = map(np.concatenate, zip(*seen, strict=True))
@@ -146,7 +149,7 @@ def distances(views: list[CameraInfo], tracks: list[Track | None]) -> float:
     return float(np.median(far[shared] / near[shared])) if shared.any() else 1.0
 
 
-def _data_words(dataset: argparse.Namespace) -> list[str]:
+def _list_data_words(dataset: argparse.Namespace) -> list[str]:
     """Words for train.py that choose and read the data as model options say: all but _NOT_OF_DATA."""
     words = []
     for option in ModelParams.options:
@@ -156,7 +159,7 @@ def _data_words(dataset: argparse.Namespace) -> list[str]:
     return words
 
 
-def _trained(line: list[str]) -> None:
+def _train(line: list[str]) -> None:
     """Run a training to its end, also where a signal interrupts it, and show how far it is.
 
     UserError with its last message if it fails.
@@ -177,13 +180,13 @@ def _trained(line: list[str]) -> None:
         raise UserError(said.strip().rpartition("\n")[2].removeprefix("error: ") or "the short training failed")
 
 
-def _of_short_training(dataset: argparse.Namespace) -> Iterator[Finding]:
-    """What a short training of small photos leaves over."""
+def _train_shortly(dataset: argparse.Namespace) -> Iterator[Finding]:
+    """Train shortly on small photos, and advise by the errors that remain."""
     with tempfile.TemporaryDirectory() as folder:
         own = ["-m", folder, "-r", _WIDTH, "--iterations", _ITERATIONS, "--quiet", "--no_curve", "--disable_viewer"]
         own += ["--no_last_checkpoint"]
         print(f"{_ITERATIONS:,} iterations on photos of {_WIDTH} pixels show what the records do not", flush=True)
-        _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
+        _train([sys.executable, str(ROOT / "train.py"), *map(str, own), *_list_data_words(dataset)])
         scene, views = load_scored(folder)
         for advise_part in tools("advise_trained"):
             yield from advise_part(scene, views)

@@ -1,4 +1,4 @@
-"""What has changed since a training: the model, or photos, which then show other views than those of their cameras."""
+"""Changes since a training: of the model, or of photos, which then show other views than those of their cameras."""
 
 from pathlib import Path
 
@@ -22,7 +22,7 @@ _SUSPECTS = 12  # views whose photos are looked for among all, those that fit wo
 LOST = 6.0  # dB below the record, from which on something has changed
 
 
-def recorded_psnr(model: Path, iteration: int) -> float | None:
+def read_recorded_psnr(model: Path, iteration: int) -> float | None:
     """PSNR of training views that training recorded at an iteration, in its curve or log; None if in neither."""
     try:
         rows = [*curve_of(model), *read_log(model / LOG)]
@@ -32,12 +32,12 @@ def recorded_psnr(model: Path, iteration: int) -> float | None:
     return next((score for score in found if score is not None), None)
 
 
-def what_changed(scene: Scene, scored: ScoredViews, now: float, then: float | None) -> Finding | None:
-    """Return what has changed where views have the PSNR `now`, None: nothing is known of it.
+def find_changes(scene: Scene, scored: ScoredViews, now: float, then: float | None) -> Finding | None:
+    """Return a text on the changes that explain the PSNR `now` of some views; None if no change is known.
 
-    then: their PSNR in training, None if it is not known.
+    then: PSNR of the same views in training, None if it is not known.
     """
-    if strange := strange_photos(scene, scored):
+    if strange := check_strange_photos(scene, scored):
         return strange
     if then is None or now >= then - LOST:
         return None
@@ -46,10 +46,11 @@ def what_changed(scene: Scene, scored: ScoredViews, now: float, then: float | No
 
 
 @torch.no_grad()
-def strange_photos(scene: Scene, scored: ScoredViews) -> Finding | None:
-    """Whether photos show other views than those of their cameras.
+def check_strange_photos(scene: Scene, scored: ScoredViews) -> Finding | None:
+    """Find photos that show other views than those of their cameras.
 
-    Such a view fits another photo clearly better than its own, and its own photo fits another view clearly better.
+    The view of such a camera fits another photo clearly better than its own, and its photo fits another view clearly
+    better.
     """
     views = [view for view in scene.getTrainCameras() if view.columns is None]
     size = views and (views[0].image_height, views[0].image_width)

@@ -26,7 +26,7 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
         import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 
         lines += environment.check_build()
-        complete = environment.extensions_load()
+        complete = environment.can_load_extensions()
     problems = _show("environment", lines)
     if not complete:
         print("dataset and model were not checked, because packages are missing")

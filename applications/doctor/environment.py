@@ -24,27 +24,27 @@ _TOLERANCE = 1e-5
 
 
 def check_packages() -> list[Finding]:
-    """Packages of requirements.txt: whether they are installed, in any version."""
-    versions = {name: _version(name) for name in _required()}
+    """Check that the packages of requirements.txt are installed, in any version."""
+    versions = {name: _read_version(name) for name in _list_required()}
     if missing := [name for name, found in versions.items() if not found]:
         return [Finding(f"packages are missing: {', '.join(missing)}", f"run `{_INSTALL}`")]
     found = ", ".join(f"{name} {version}" for name, version in versions.items())
     lines = [fine(f"Python {platform.python_version()}, {found}")]
-    if not _version("tensorboard"):
+    if not _read_version("tensorboard"):
         lines.append(fine("no TensorBoard, so trainings write no event files (pip install tensorboard brings it)"))
     return lines
 
 
 def check_build() -> list[Finding]:
-    """torch and its CUDA, the extensions and their versions; torch must be installed."""
+    """Check torch and its CUDA, the extensions and their versions; torch must be installed."""
     import torch
 
     lines = [_check_gpu(torch), *map(_check_extension, EXTENSIONS)]
-    return [*lines, _check_rasterizer(torch)] if extensions_load() else lines
+    return [*lines, _check_rasterizer(torch)] if can_load_extensions() else lines
 
 
-def extensions_load() -> bool:
-    """Whether all three extensions can be imported, and are those of this code."""
+def can_load_extensions() -> bool:
+    """Tell if all three extensions can be imported, and are those of this code."""
     try:
         importlib.import_module("groundwork.host.extensions")
         for name in EXTENSIONS:
@@ -58,7 +58,7 @@ def _package(extension: str) -> str:
     return extension.replace("-", "_")
 
 
-def _required() -> list[str]:
+def _list_required() -> list[str]:
     text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
     names = dict.fromkeys(re.findall(r"^([A-Za-z0-9_-]+)==", text, re.MULTILINE))
     if sys.platform == "linux" and platform.machine() != "x86_64":
@@ -66,7 +66,7 @@ def _required() -> list[str]:
     return list(names)
 
 
-def _version(name: str) -> str | None:
+def _read_version(name: str) -> str | None:
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -81,7 +81,7 @@ def _check_gpu(torch) -> Finding:
         remedy = f"use a GPU of {OLDEST_GPU[0]}.{OLDEST_GPU[1]} or newer, or set CUDA_VISIBLE_DEVICES= to use the CPU"
         text = f"GPU {name}, compute capability {found[0]}.{found[1]}, CUDA {torch.version.cuda} of torch"
         return Finding(text, remedy) if found < OLDEST_GPU else fine(text)
-    if not (gpu := _nvidia_gpu()):
+    if not (gpu := _find_nvidia_gpu()):
         return fine("no NVIDIA GPU; everything runs on the CPU")
     if torch.version.cuda is None:
         return Finding(
@@ -91,7 +91,7 @@ def _check_gpu(torch) -> Finding:
     return Finding(f"{gpu} is there, but torch (CUDA {torch.version.cuda}) cannot use it", remedy)
 
 
-def _nvidia_gpu() -> str:
+def _find_nvidia_gpu() -> str:
     """Name of the first GPU that the driver's own tool lists; empty if there is none."""
     tool = find_program("nvidia-smi")
     if not tool:
@@ -106,7 +106,7 @@ def _nvidia_gpu() -> str:
 def _check_extension(name: str) -> Finding:
     package = _package(name)
     extension, again = f"the extension {name}", f"run `pip install ./submodules/{name}`"
-    installed = _version(name) or _version(WHOLE)
+    installed = _read_version(name) or _read_version(WHOLE)
     if installed is None:
         return Finding(f"{extension} is not installed", again)
     expected = (ROOT / "version.txt").read_text(encoding="utf-8").strip()
@@ -118,17 +118,17 @@ def _check_extension(name: str) -> Finding:
         return Finding(f"{extension} does not load ({error})", again)
     sources = ROOT / "submodules" / name / package
     paths = [path.relative_to(sources) for path in sorted(sources.rglob("*.py"))]
-    if stale := [str(path) for path in paths if _differ(sources / path, folder / path)]:
+    if stale := [str(path) for path in paths if _is_different(sources / path, folder / path)]:
         return Finding(f"{extension} was installed from other sources than these ({', '.join(stale)})", again)
     return fine(f"extension {name} {installed}")
 
 
-def _differ(source: Path, installed: Path) -> bool:
+def _is_different(source: Path, installed: Path) -> bool:
     return not installed.is_file() or source.read_bytes() != installed.read_bytes()
 
 
 def _check_rasterizer(torch) -> Finding:
-    """One splat against the float64 oracle, on every device that training could use."""
+    """Compare one splat with the float64 oracle, on every device that training could use."""
     import diff_gaussian_rasterization as rasterizer
     from diff_gaussian_rasterization import reference
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from applications.doctor.changes import FITS as BAD_PSNR
-from applications.doctor.changes import LOST, recorded_psnr, what_changed
+from applications.doctor.changes import LOST, find_changes, read_recorded_psnr
 from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.finding import Finding, fine, from_error
@@ -38,9 +38,10 @@ _WIDTH = 200  # pixels of a view, or fewer where it was trained smaller
 
 
 def check_model(model_path: str, iteration: int, source: str | None = None, images: str | None = None) -> list[Finding]:
-    """What to say of the model that train.py wrote into a folder; iteration -1: the last one saved.
+    """Check the model that train.py wrote into a folder.
 
-    source, images: scene folder and its folder of photos, None: those that the model was trained on.
+    iteration: -1: the last one saved.
+    source, images: scene folder and its folder of photos; None: those that the model was trained on.
     """
     try:
         own = read_stored_options(model_path)
@@ -53,11 +54,11 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
     if not len(gaussians):
         return [Finding(f"{name} has no Gaussians, so renders show the background", "train it again")]
     lines = [fine(f"{name}, {len(gaussians)} Gaussians of SH degree {gaussians.max_sh_degree}")]
-    if wrong := [*_not_finite(gaussians)]:
+    if wrong := [*_check_finite(gaussians)]:
         return [*lines, *wrong]
-    lines.append(_shapes(scene))
-    renders, changed = _renders(scene, options, stored)
-    if renders.is_problem and stored != own and _fits(model_path, own, scene.loaded_iter):
+    lines.append(_check_shapes(scene))
+    renders, changed = _compare_renders(scene, options, stored)
+    if renders.is_problem and stored != own and _renders_well(model_path, own, scene.loaded_iter):
         other_scene = stored["source_path"] != own["source_path"]
         what, name, option = ("scene", "source_path", "-s") if other_scene else ("photos", "images", "-i")
         said = f"the model fits the {what} that it was trained on, but not {stored[name]}"
@@ -65,18 +66,18 @@ def check_model(model_path: str, iteration: int, source: str | None = None, imag
         changed = True
     if changed:  # which explains all else, and the training has no say in it
         return [*lines, renders]
-    reset = [] if renders.is_problem else _late_reset(scene)
-    odd = [] if renders.is_problem else _notes(scene, options)
+    reset = [] if renders.is_problem else _check_late_reset(scene)
+    odd = [] if renders.is_problem else _examine_parts(scene, options)
     return [*lines, renders, *odd, *reset, *check_training(Path(model_path))]
 
 
-def _fits(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
-    """Whether the model renders the views of the scene that it was trained on well."""
+def _renders_well(model_path: str, stored: dict[str, Any], iteration: int) -> bool:
+    """Tell if the model renders well the views of the scene that it was trained on."""
     try:
         options, scene = _load(model_path, stored, iteration)
     except UserError:
         return False
-    return not _renders(scene, options, stored)[0].is_problem
+    return not _compare_renders(scene, options, stored)[0].is_problem
 
 
 def check_training(model: Path) -> list[Finding]:
@@ -88,9 +89,10 @@ def check_training(model: Path) -> list[Finding]:
 
 
 def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argparse.Namespace, Scene]:
-    """Options and scene of a model with small views, which are enough to tell black renders from bad ones.
+    """Load options and scene of a model, with views that are just large enough to tell black renders from bad ones.
 
-    They are no larger than in training: a model of small photos has no detail for larger ones, and looks broken there.
+    The views are no larger than in training: a model of small photos has no detail for larger ones, and looks broken
+    there.
     """
     given = {**stored, "model_path": model_path, "resolution": _WIDTH, "images_to_load": 1}
     given |= {option.name: option.default for option in options_of("model") if not option.seen}
@@ -98,21 +100,21 @@ def _load(model_path: str, stored: dict[str, Any], iteration: int) -> tuple[argp
     with contextlib.redirect_stdout(io.StringIO()):  # from the readers
         scene = load_saved(options, iteration)
         trained = stored.get("resolution", -1)
-        widths = [_trained_width(view, trained) for view in scene.info.train_cameras]
+        widths = [_find_trained_width(view, trained) for view in scene.info.train_cameras]
         if min(widths, default=_WIDTH) < _WIDTH:
             options.resolution = trained if max(widths) <= _WIDTH else min(widths)
             scene = load_saved(options, iteration)
         return options, scene
 
 
-def _trained_width(view: CameraInfo, resolution: int) -> int:
-    """Width in pixels at which a photo trains with -r, as far as it may be below _WIDTH: -1 only limits wider ones."""
+def _find_trained_width(view: CameraInfo, resolution: int) -> int:
+    """Return the width (pixels) at which a photo trains with -r, exact below _WIDTH only: -1 limits wider ones."""
     size = photo_size(view)
     return size[0] if resolution == -1 else training_size(*size, resolution)[0]
 
 
-def _not_finite(gaussians: GaussianModel) -> Iterator[Finding]:
-    """NaN and infinities among the parameters."""
+def _check_finite(gaussians: GaussianModel) -> Iterator[Finding]:
+    """Find NaN and infinities among the parameters."""
     shapes = gaussians.raw_geometry()
     raw = {
         "position": gaussians.get_xyz,
@@ -127,45 +129,45 @@ def _not_finite(gaussians: GaussianModel) -> Iterator[Finding]:
             yield Finding(text, "resume from an earlier checkpoint, or train again, with lower learning rates")
 
 
-def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
-    """What parts of a training say of a trained model."""
+def _examine_parts(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
+    """Ask the parts of a training for notes on the trained model."""
     for examine in tools("examine"):
-        yield from examine(scene, _scored(scene, options))
+        yield from examine(scene, _make_scored_views(scene, options))
 
 
 def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:
     """The newest model of a folder in its scene, and what scores its views."""
     options, scene = _load(model_path, read_stored_options(model_path), -1)
-    return scene, _scored(scene, options)
+    return scene, _make_scored_views(scene, options)
 
 
-def _late_reset(scene: Scene) -> Iterator[Finding]:
-    """What training said at its start of a reset, if the opacities have not recovered from it."""
+def _check_late_reset(scene: Scene) -> Iterator[Finding]:
+    """Repeat the warning about a late reset that training printed at its start, if the opacities have not recovered."""
     faint = float(scene.gaussians.get_opacity.detach().median()) < UNRECOVERED
     lines = closing_lines(Path(scene.model_path)) if faint else []
     said = [line.removeprefix("warning: ") for line in lines]
     yield from (from_error(UserError(text)) for text in said if text.startswith(LATE_RESET))
 
 
-def _shapes(scene: Scene) -> Finding:
+def _check_shapes(scene: Scene) -> Finding:
     opacities = scene.gaussians.get_opacity.detach()
     sizes = scene.gaussians.get_scaling.detach().max(dim=1).values / scene.cameras_extent
     said = f"opacities: median {opacities.median():.2f}; sizes: median {sizes.median():.2g}, largest {sizes.max():.2g}"
     return fine(f"{said} extents of the cameras")
 
 
-def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> tuple[Finding, bool]:
+def _compare_renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) -> tuple[Finding, bool]:
     """Compare a few small training views with their photos; return also whether these or the model have changed."""
-    views = _looked_at(scene)
-    means = _means(views, scene, options)
+    views = _choose_views(scene)
+    means = _average_views(views, scene, options)
     if means is None:
         return Finding("no pixel of the inspected training views counts", "check --masks and --invert_masks"), False
     black = means.render < BLACK
     if black and means.photo < BLACK:
         return Finding("the photos themselves are black", "inspect them; if they are transparent, train with -w"), False
-    then = recorded_psnr(Path(scene.model_path), scene.loaded_iter)
+    then = read_recorded_psnr(Path(scene.model_path), scene.loaded_iter)
     good = not black and means.psnr >= max(BAD_PSNR, (then or 0.0) - LOST)
-    changed = what_changed(scene, _scored(scene, options), means.psnr, then)
+    changed = find_changes(scene, _make_scored_views(scene, options), means.psnr, then)
     if good and changed:  # a few other photos leave a good mean
         return changed, True
     if good:
@@ -173,7 +175,7 @@ def _renders(scene: Scene, options: argparse.Namespace, stored: dict[str, Any]) 
         return fine(f"{len(views)} training views rendered {width} pixels wide: PSNR {means.psnr:.1f} dB"), False
     text = "renders of the training views are black"
     text = text if black else f"training views have a PSNR of only {means.psnr:.1f} dB"
-    wrong = changed or next(_late_reset(scene), None) or Finding("", _remedy(scene, stored, black))
+    wrong = changed or next(_check_late_reset(scene), None) or Finding("", _suggest_remedy(scene, stored, black))
     return wrong._replace(text=f"{text}: {wrong.text}" if wrong.text else text), wrong is changed
 
 
@@ -185,40 +187,40 @@ class Means(NamedTuple):
     psnr: float
 
 
-def _looked_at(scene: Scene) -> list[Camera]:
+def _choose_views(scene: Scene) -> list[Camera]:
     cameras = [camera for camera in scene.getTrainCameras() if camera.columns is None]  # whole views
     return cameras[:: -(-len(cameras) // _VIEWS) or 1]
 
 
-def _means(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> Means | None:
+def _average_views(cameras: list[Camera], scene: Scene, options: argparse.Namespace) -> Means | None:
     """Means over the views of which some pixel counts (masks, half images); None if there are none."""
-    measured = [values for camera in cameras if (values := _measure(camera, scene, options))]
+    measured = [values for camera in cameras if (values := _measure_view(camera, scene, options))]
     return Means(*(float(np.mean(values)) for values in zip(*measured, strict=True))) if measured else None
 
 
-def _pipe(scene: Scene) -> argparse.Namespace:
+def _make_pipe(scene: Scene) -> argparse.Namespace:
     pipe = PipelineParams(argparse.ArgumentParser()).extract(argparse.Namespace())
     stored = read_model_json(scene.model_path)
     pipe.antialiasing, pipe.projection = stored.get("antialiasing", False), stored.get("projection", "ewa")
     return pipe
 
 
-def _scored(scene: Scene, options: argparse.Namespace) -> ScoredViews:
+def _make_scored_views(scene: Scene, options: argparse.Namespace) -> ScoredViews:
     background = torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
-    return ScoredViews(_pipe(scene), background, scene.halves)
+    return ScoredViews(_make_pipe(scene), background, scene.halves)
 
 
 @torch.no_grad()
-def _measure(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
+def _measure_view(camera: Camera, scene: Scene, options: argparse.Namespace) -> tuple[float, ...] | None:
     """Return the `Means` of one view; None if no pixel of it counts."""
-    image, target, mask = _scored(scene, options).compared(camera, scene.gaussians)
+    image, target, mask = _make_scored_views(scene, options).compared(camera, scene.gaussians)
     if mask is not None and not mask.any():
         return None
     image, target = (pixels_that_count(x, mask) for x in (image, as_float(target)))
     return float(image.mean()), float(target.mean()), min(float(psnr(image, target).mean()), 99.0)
 
 
-def _remedy(scene: Scene, stored: dict[str, Any], is_black: bool) -> str:
+def _suggest_remedy(scene: Scene, stored: dict[str, Any], is_black: bool) -> str:
     """Say what to check where renders are bad and nothing has changed since the training."""
     if not is_black and scene.loaded_iter < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"

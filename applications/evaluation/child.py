@@ -75,7 +75,7 @@ def run_child(command: Sequence[str], say: str = "", slot: Slot | None = None, *
                 if slot and slot.ended.is_set():
                     child.kill()
                 reader.join(_LOOK)
-            cpu = _wait(child)
+            cpu = _wait_for(child)
         finally:
             if child.poll() is None:
                 child.kill()
@@ -84,14 +84,14 @@ def run_child(command: Sequence[str], say: str = "", slot: Slot | None = None, *
             if not reader.is_alive():
                 child.stderr.close()
         requested, status = interrupt.requested, child.returncode
-    lines = _lines(tail)
+    lines = _last_lines(tail)
     if status < 0:
         lines.append(f"killed by {signal.Signals(-status).name}")
     return Finished(status, lines or [f"exit status {status}"], time.perf_counter() - start, cpu, requested)
 
 
-def share(items: Iterable[Item], gpus: Sequence[str], do: Callable[[Item, Slot], None]) -> None:
-    """Do something with each item, on one GPU after another as they become free. It runs children by `run_child`.
+def share_gpus(items: Iterable[Item], gpus: Sequence[str], do: Callable[[Item, Slot], None]) -> None:
+    """Call `do` with each item and with a GPU as soon as one is free; `do` runs children by `run_child`.
 
     Ctrl-C and other signals end all of them, as in `run_child`, and are raised.
     """
@@ -127,8 +127,8 @@ def _read(child: subprocess.Popen, tail: bytearray, shown: bool) -> None:
                 sys.stderr.flush()
 
 
-def _wait(child: subprocess.Popen) -> float | None:
-    """Wait for a child's end; its CPU seconds, with those of its own children, None if it was waited for already."""
+def _wait_for(child: subprocess.Popen) -> float | None:
+    """Wait for a child's end; return the CPU seconds of it and its children, None if it was waited for already."""
     try:
         _, status, usage = os.wait4(child.pid, 0)
     except ChildProcessError:  # it ended as it was told to
@@ -138,7 +138,7 @@ def _wait(child: subprocess.Popen) -> float | None:
     return usage.ru_utime + usage.ru_stime
 
 
-def _lines(tail: bytearray) -> list[str]:
+def _last_lines(tail: bytearray) -> list[str]:
     """The last lines, without progress bars, which redraw their line with carriage returns."""
     lines = (line.rsplit("\r", 1)[-1] for line in tail.decode("utf-8", "replace").split("\n"))
     return [line.rstrip() for line in lines if line.strip() and not re.search(r"\d+%\|", line)][-LINES:]

@@ -22,17 +22,17 @@ from typing import Any
 import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 
 from applications.evaluation import plan, stages
-from applications.evaluation.child import Finished, Slot, run_child, share
-from applications.evaluation.configs import check_options, read_configs, shipped
+from applications.evaluation.child import Finished, Slot, run_child, share_gpus
+from applications.evaluation.configs import check_options, list_shipped, read_configs
 from applications.evaluation.plan import Run, SceneEntry
 from applications.evaluation.report import make_report, write_report
 from applications.evaluation.results import read_earlier, read_run
 from applications.evaluation.stages import Failure, StageFailed
-from applications.evaluation.tables import MAIN, Table, gains_table, result_tables
+from applications.evaluation.tables import MAIN, Table, make_gains_table, make_result_tables
 from arguments import OptionParser
 from groundwork.files.folders import locked
 from groundwork.host.listing import markdown_table
-from groundwork.host.machine import facts_asked
+from groundwork.host.machine import facts_from_process
 from splatting.records.error_curve import peers_of
 from utils.system_utils import UserError, mkdir_p
 
@@ -49,7 +49,7 @@ _SHORT_FOR = {  # flags: words for train.py that they stand for, and help
 }
 
 
-def _parser() -> OptionParser:
+def _make_parser() -> OptionParser:
     parser = OptionParser(
         description=__doc__.splitlines()[0],
         epilog="Options after -- go to train.py. A training counts as finished if it used the same scene folder and "
@@ -79,7 +79,7 @@ def _parser() -> OptionParser:
         help="train with each of these seeds and report mean and standard deviation (default: once)")  # fmt: skip
     add("--configs", type=Path, metavar="FILE",
         help='train with each option set of a JSON file, {"name": ["--sh_degree", "1"], ...}, and compare them; '
-        f"{' or '.join(shipped())} names a file that comes with this program (default: once)")  # fmt: skip
+        f"{' or '.join(list_shipped())} names a file that comes with this program (default: once)")  # fmt: skip
     add("--peer", nargs=2, action="append", default=[], metavar=("NAME", "FILE"),
         help="draw another program's error against time beside ours, from a CSV file with the columns seconds and "
         "test_psnr (`python -m applications.evaluation.peer_curve` makes it); with several "
@@ -95,7 +95,7 @@ def _parser() -> OptionParser:
     return parser
 
 
-def _scenes(args: Namespace) -> list[SceneEntry]:
+def _list_scenes(args: Namespace) -> list[SceneEntry]:
     groups = ("mipnerf360", "tanksandtemples", "deepblending")
     roots = [(group, root) for group in groups if (root := getattr(args, group))]
     scenes = [entry for group, root in roots for entry in plan.dataset_scenes(group, root, args.resize)]
@@ -115,7 +115,7 @@ def _scenes(args: Namespace) -> list[SceneEntry]:
     return scenes
 
 
-def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
+def _plan_all(args: Namespace, more: Sequence[str]) -> list[Run]:
     """Plan the runs; UserError for invalid options, before hours are spent."""
     if args.iterations is not None and args.iterations < 1:
         raise UserError(f"--iterations must be at least 1, got {args.iterations}")
@@ -136,7 +136,7 @@ def _plan(args: Namespace, more: Sequence[str]) -> list[Run]:
     common += [*([] if args.iterations is None else ["--iterations", str(args.iterations)]), *more]
     if args.seeds and any(word.split("=")[0] == "--seed" for word in (*common, *sum(configs.values(), ()))):
         raise UserError("--seed is given twice; omit it when --seeds is given")
-    runs = plan.plan_runs(_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
+    runs = plan.plan_runs(_list_scenes(args), args.output_path.resolve(), common, configs, args.seeds)
     plan.check_outside_scenes(runs)
     plan.check_nesting(runs, args.output_path.resolve())
     if not args.skip_training:
@@ -153,8 +153,8 @@ def _parse_for_training(words: Sequence[str]) -> tuple[Namespace, ...]:
     return train.parse(words)
 
 
-def _visible(gpus: Sequence[int]) -> list[str]:
-    """What CUDA_VISIBLE_DEVICES is for each of these GPUs. UserError if there is no such GPU."""
+def _map_gpus(gpus: Sequence[int]) -> list[str]:
+    """Return the value of CUDA_VISIBLE_DEVICES for each of these GPUs. UserError if there is no such GPU."""
     if not gpus:
         return []
     import torch  # here, as it takes a second
@@ -171,7 +171,7 @@ def _carry_out(
     runs: Sequence[Run], args: Namespace, gpus: Sequence[str], failures: dict[Run, Failure], start: Start
 ) -> None:
     """Carry out every run; note and print a failure, and continue with the next run."""
-    facts = {} if args.skip_training else facts_asked()
+    facts = {} if args.skip_training else facts_from_process()
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
 
@@ -180,7 +180,7 @@ def _carry_out(
         number, run = numbered
         begun, child = time.perf_counter(), partial(start, slot=slot)
         head = f"[{number}/{len(runs)}] {run.title}"
-        _say(f"{head}: on GPU {slot.gpu}" if slot else head)
+        _print_line(f"{head}: on GPU {slot.gpu}" if slot else head)
         try:
             if not args.skip_training:
                 stages.train(run, facts, child)
@@ -189,27 +189,27 @@ def _carry_out(
             if not args.skip_metrics:
                 download = stages.score(run, child, download, args.weights, args.stlpips)
             if args.html_models:
-                stages.page(run, args.output_path.resolve(), options, child)
+                stages.write_page(run, args.output_path.resolve(), options, child)
             end = f"finished in {time.perf_counter() - begun:.0f} s"
         except StageFailed as failed:
             failures[run] = failed.failure
             end = f"FAILED ({failed.failure.stage}): {failed}"
-        _say(f"{head}: {end}" if slot else f"  {end}")
+        _print_line(f"{head}: {end}" if slot else f"  {end}")
 
     if gpus:
-        share(enumerate(runs, 1), gpus, carry_out)
+        share_gpus(enumerate(runs, 1), gpus, carry_out)
     else:
         for numbered in enumerate(runs, 1):
             carry_out(numbered)
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     """Print a line at once and whole, as other threads print, too."""
     sys.stdout.write(f"{line}\n")
     sys.stdout.flush()
 
 
-def _report(
+def _write_report(
     command: Sequence[str], runs: Sequence[Run], failures: dict[Run, Failure], peers: list[dict[str, Any]], output: Path
 ) -> bool:
     """Write and print the report of these runs and those of earlier calls; return whether any of these has scores.
@@ -230,15 +230,16 @@ def _report(
     named = {(peer["scene"], peer["name"]): peer for peer in (*earlier["peers"], *peers) if peer["scene"] in scenes}
     report = make_report(command, results, list(named.values()), earlier["commands"])
     write_report(report, output)
-    for table in result_tables([*report["summary"], *report["means"]], MAIN):
-        print(f"\n{table.title}\n{_text(table)}" if table.title else _text(table))
+    for table in make_result_tables([*report["summary"], *report["means"]], MAIN):
+        print(f"\n{table.title}\n{_format_table(table)}" if table.title else _format_table(table))
     for scene, found in report["gains"].items():
-        print(f"\n{scene}: gain in test PSNR over {found['default']} on the same seeds\n{_text(gains_table(found))}")
+        title = f"{scene}: gain in test PSNR over {found['default']} on the same seeds"
+        print(f"\n{title}\n{_format_table(make_gains_table(found))}")
     print(f"\nreport: {output / 'report.html'}")
     return scored
 
 
-def _text(table: Table) -> str:
+def _format_table(table: Table) -> str:
     return markdown_table(table.header, table.rows)
 
 
@@ -246,10 +247,10 @@ def main(argv: Sequence[str] | None = None, start: Start = run_child) -> None:
     """Run the command line. start: how a stage's command is run."""
     words = list(sys.argv[1:] if argv is None else argv)
     end = words.index("--") if "--" in words else len(words)
-    args = _parser().parse_args(words[:end])
-    runs = _plan(args, words[end + 1 :])
+    args = _make_parser().parse_args(words[:end])
+    runs = _plan_all(args, words[end + 1 :])
     peers = peers_of(args.peer, list(dict.fromkeys(run.scene.name for run in runs)))
-    gpus, output = _visible(args.gpus), args.output_path.resolve()
+    gpus, output = _map_gpus(args.gpus), args.output_path.resolve()
     mkdir_p(output)
     failures: dict[Run, Failure] = {}
     busy = "full_eval.py (process {process}), or a training that it started,"
@@ -257,7 +258,7 @@ def main(argv: Sequence[str] | None = None, start: Start = run_child) -> None:
         try:
             _carry_out(runs, args, gpus, failures, start)
         finally:  # report the finished runs after Ctrl-C too
-            scored = _report(["full_eval.py", *words], runs, failures, peers, output)
+            scored = _write_report(["full_eval.py", *words], runs, failures, peers, output)
     if failures:
         print(
             f"{len(failures)} of {len(runs)} runs failed: {', '.join(run.title for run in failures)}", file=sys.stderr

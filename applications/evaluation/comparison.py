@@ -37,7 +37,7 @@ Run = Mapping[str, Any]
 Sets = Mapping[str, Sequence[Run]]  # option set -> its runs, one for each seed
 
 
-def spread(values: Iterable[float | None]) -> dict[str, Any]:
+def summarise_spread(values: Iterable[float | None]) -> dict[str, Any]:
     """Return the mean, the sample standard deviation (with n - 1; None for one value) and the values.
 
     The mean is None if any value is: a mean over fewer seeds could not be compared.
@@ -51,7 +51,7 @@ def spread(values: Iterable[float | None]) -> dict[str, Any]:
     }
 
 
-def grouped(items: Iterable[dict[str, Any]], *names: str) -> dict[Any, list[dict[str, Any]]]:
+def group_by(items: Iterable[dict[str, Any]], *names: str) -> dict[Any, list[dict[str, Any]]]:
     """Group items by their value of a name, or values of several names, in the order of first occurrence."""
     groups: dict[Any, list[dict[str, Any]]] = {}
     for item in items:
@@ -64,14 +64,14 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the spread of QUANTITIES over the seeds, for each scene, option set and scored iteration.
 
     Rows are in the order of `runs`. Seeds whose run failed are left out and listed as `failed_seeds`. Where the seeds
-    were scored on different ground truth, scores have no mean. apart: see `stand_apart`. iteration: the
+    were scored on different ground truth, scores have no mean. apart: see `mark_apart`. iteration: the
     mean of `iterations`, which are several where each seed ended by itself (`open_ended`).
     """
     rows = []
-    for (scene, config), members in grouped(runs, "scene", "config").items():
-        for at in _moments([run for run in members if not run["failure"]]):
+    for (scene, config), members in group_by(runs, "scene", "config").items():
+        for at in _list_moments([run for run in members if not run["failure"]]):
             there = [run for run, _ in at]
-            row = {name: spread(run["iterations"][str(t)].get(name) for run, t in at) for name in QUANTITIES}
+            row = {name: summarise_spread(run["iterations"][str(t)].get(name) for run, t in at) for name in QUANTITIES}
             iterations = sorted({t for _, t in at})
             one = len({run["ground_truth_sha256"] for run in there}) == 1
             if not one:
@@ -93,10 +93,10 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _moments(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], int]]]:
-    """Return what the rows of an option set are about: in each, runs with a scored iteration.
+def _list_moments(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], int]]]:
+    """Return for each row of an option set its runs, each with a scored iteration.
 
-    It is the same iteration of all, and the last one of runs that ended by themselves.
+    The iteration is the same for all runs of a row, but the last one of runs that ended by themselves.
     """
     fixed = [run for run in runs if not run["open_ended"]]
     scored = {int(n) for run in fixed for n, values in run["iterations"].items() if values["views"]}
@@ -105,41 +105,43 @@ def _moments(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], 
     return [*rows, *([ended] if ended else [])]
 
 
-def scene_means(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def average_scenes(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return rows of means over the scenes of a data set, for each option set and iteration that all of them have.
 
     They are like those of `summarise`, with the number of `scenes`. Where these have the same seeds, a mean is spread
     over them, too. iteration: null where the trainings ended by themselves.
     """
-    means, scenes = [], {group: {row["scene"] for row in there} for group, there in grouped(rows, "group").items()}
+    means, scenes = [], {group: {row["scene"] for row in there} for group, there in group_by(rows, "group").items()}
     comparable = (row | {"iteration": None} if row["open_ended"] else row for row in rows if not row["apart"])
-    for (group, config, iteration), members in grouped(comparable, "group", "config", "iteration").items():
+    for (group, config, iteration), members in group_by(comparable, "group", "config", "iteration").items():
         count = len(scenes[group])
         if count < 2 or {row["scene"] for row in members} != scenes[group]:
             continue
         seeds = members[0]["seeds"] if all(row["seeds"] == members[0]["seeds"] for row in members) else [None]
         of = "" if group not in DATASETS else f" of {group}"
-        mean = {name: _over_scenes([row[name] for row in members], len(seeds)) for name in QUANTITIES}
+        mean = {name: _average_spreads([row[name] for row in members], len(seeds)) for name in QUANTITIES}
         mean |= {"apart": False, "config": config, "group": group, "iteration": iteration, "scenes": count}
         whole = scenes[group] == DATASETS.get(group, {}).keys()
         means.append(mean | {"scene": f"mean{of}" if whole else f"mean of {count} scenes{of}", "seeds": seeds})
     return means
 
 
-def _over_scenes(spreads: Sequence[dict[str, Any]], seeds: int) -> dict[str, Any]:
+def _average_spreads(spreads: Sequence[dict[str, Any]], seeds: int) -> dict[str, Any]:
     """Return the spread of the mean over scenes. spreads: of a quantity, of each scene. seeds: 1 if they differ."""
     if seeds == 1 or any(one["mean"] is None for one in spreads):
-        return spread([None if None in (means := [one["mean"] for one in spreads]) else statistics.fmean(means)])
-    return spread(map(statistics.fmean, zip(*(one["values"] for one in spreads), strict=True)))
+        return summarise_spread(
+            [None if None in (means := [one["mean"] for one in spreads]) else statistics.fmean(means)]
+        )
+    return summarise_spread(map(statistics.fmean, zip(*(one["values"] for one in spreads), strict=True)))
 
 
-def stand_apart(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+def mark_apart(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Return the runs with `apart`, whether comparisons of the scene must leave the run out, and `why_apart`.
 
     Where a scene was scored on several ground truths, the one of most runs counts, the first of equals. An option set
     stands apart if any of its runs has another one, or none that is known.
     """
-    scenes, sets, marked = grouped(runs, "scene"), grouped(runs, "scene", "config"), []
+    scenes, sets, marked = group_by(runs, "scene"), group_by(runs, "scene", "config"), []
     for run in runs:
         there = scenes[run["scene"]]
         known = Counter(filter(None, (other["ground_truth_sha256"] for other in there)))
@@ -147,14 +149,15 @@ def stand_apart(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         seeds = {other["ground_truth_sha256"] for other in sets[run["scene"], run["config"]]}
         apart = len(known) > 1 and seeds != {counts}
         like = next(other for other in there if other["ground_truth_sha256"] == counts)
-        marked.append({**run, "apart": apart, "why_apart": _why(run, seeds, like) if apart else None})
+        marked.append({**run, "apart": apart, "why_apart": _explain_apart(run, seeds, like) if apart else None})
     return marked
 
 
-def _why(run: Run, seeds: set[str | None], like: Run) -> str:
-    """Return in what a run's test views differ from those of the ground truth that counts, as far as is known.
+def _explain_apart(run: Run, seeds: set[str | None], like: Run) -> str:
+    """Return the known differences of a run's test views from those of the ground truth that counts.
 
-    seeds: ground truths of the run's option set. like: a run with the ground truth that counts.
+    seeds: ground truths of the run's option set.
+    like: a run with the ground truth that counts.
     """
     if run["ground_truth_sha256"] is None:
         return "its ground truth is not known"
@@ -163,7 +166,10 @@ def _why(run: Run, seeds: set[str | None], like: Run) -> str:
     (size, other_size), (count, other_count), (words, other_words) = (
         (" ".join(f"{w}x{h}" for w, h in one["test_sizes"]) for one in (run, like)),
         (one["views"]["test"] for one in (run, like)),
-        (" ".join(filter(_decides, with_values(one["options"] or ()))) or "the defaults" for one in (run, like)),
+        (
+            " ".join(filter(_decides_pixels, split_options(one["options"] or ()))) or "the defaults"
+            for one in (run, like)
+        ),
     )
     reasons = [f"its test views have {size} pixels, the others' {other_size}"] if size != other_size else []
     reasons += [f"it has {count} test views, the others {other_count}"] if count != other_count else []
@@ -171,35 +177,35 @@ def _why(run: Run, seeds: set[str | None], like: Run) -> str:
     return "; ".join(reasons + ([f"{words} instead of {other_words}"] if words != other_words else []))
 
 
-def with_values(words: Sequence[str]) -> list[str]:
+def split_options(words: Sequence[str]) -> list[str]:
     """Return each option of a command line with its values, as one text."""
     return re.split(r" (?=--?[a-zA-Z])", " ".join(words))
 
 
-def _decides(option: str) -> bool:
+def _decides_pixels(option: str) -> bool:
     return re.split("[ =]", option)[0] in DECIDING
 
 
-def comparable_sets(runs: Sequence[Run], scene: str) -> dict[str, list[Run]]:
+def find_comparable_sets(runs: Sequence[Run], scene: str) -> dict[str, list[Run]]:
     """Return the finished runs of a scene by option set, without sets that stand apart; none if there is but one."""
     known = (run for run in runs if run["config"] and run["finished"] and not run["apart"])
-    sets = grouped((run for run in known if run["scene"] == scene), "config")
+    sets = group_by((run for run in known if run["scene"] == scene), "config")
     return sets if len(sets) > 1 else {}
 
 
-def default_set(sets: Sets) -> str:
+def choose_default_set(sets: Sets) -> str:
     """Return the name of the set that others are compared with: the first of DEFAULT, else the first set."""
     return next((name for name in DEFAULT if name in sets), next(iter(sets)))
 
 
-def uneven_shares(runs: Iterable[Run]) -> tuple[float, float] | None:
-    """Return the least and the most of a processor that trainings got, if they differ too much to compare seconds."""
+def find_uneven_shares(runs: Iterable[Run]) -> tuple[float, float] | None:
+    """Return the smallest and largest share of a processor that trainings had, if too unlike to compare seconds."""
     shares = [run["cpu_seconds"] / run["wall_seconds"] for run in runs
               if run["cpu_seconds"] is not None and (run["wall_seconds"] or 0) >= SHORTEST]  # fmt: skip
     return (min(shares), max(shares)) if shares and min(shares) <= EVEN * max(shares) else None
 
 
-def published_tables() -> list[dict[str, Any]]:
+def read_published() -> list[dict[str, Any]]:
     """Read the published tables.
 
     A table has name, source, hardware and note. `groups` and `requires` tell which runs can be compared with it.
@@ -218,21 +224,21 @@ def compare(
     of our training that the table's did not have (null: not known); they may explain a difference.
     """
     compared = []
-    for table in published_tables():
+    for table in read_published():
         for row in rows:
             ours = [run for run in runs if (run["scene"], run["config"]) == (row["scene"], row["config"])]
             theirs = table["scenes"].get(row["scene"], {}).get(str(None if row["open_ended"] else row["iteration"]))
-            if theirs and row["group"] in table["groups"] and _meets(ours[0], table.get("requires", {})):
-                compared.append(_comparison(table, row, theirs, ours))
+            if theirs and row["group"] in table["groups"] and _meets_requirements(ours[0], table.get("requires", {})):
+                compared.append(_compare_with(table, row, theirs, ours))
         for mean in means:
             theirs = table["means"].get(mean["group"], {}).get(str(mean["iteration"]))
             if theirs and mean["scenes"] == len(DATASETS[mean["group"]]):
                 ours = [run for run in runs if (run["group"], run["config"]) == (mean["group"], mean["config"])]
-                compared.append(_comparison(table, mean, theirs, ours))
+                compared.append(_compare_with(table, mean, theirs, ours))
     return compared
 
 
-def _meets(run: dict[str, Any], required: dict[str, Any]) -> bool:
+def _meets_requirements(run: dict[str, Any], required: dict[str, Any]) -> bool:
     return (
         run["test_sizes"] == required.get("test_sizes", run["test_sizes"])
         and run["views"]["test"] == required.get("test_views", run["views"]["test"])
@@ -240,10 +246,10 @@ def _meets(run: dict[str, Any], required: dict[str, Any]) -> bool:
     )
 
 
-def _comparison(
+def _compare_with(
     table: dict[str, Any], ours: dict[str, Any], theirs: dict[str, float], runs: list[dict[str, Any]]
 ) -> dict[str, Any]:
-    """ours: a row of `summarise` or `scene_means`."""
+    """Compare a row of `summarise` or `average_scenes` with the same row of a published table."""
     numbers = {
         name: {"difference": mean - theirs[name], "ours": mean, "published": theirs[name]}
         for name in COMPARED

@@ -18,7 +18,7 @@ SHIPPED = Path(__file__).parent / "sets"
 _SHAPE = 'like {"base": [], "sh1": ["--sh_degree", "1"]}'
 
 
-def shipped() -> list[str]:
+def list_shipped() -> list[str]:
     """List the names of the files in sets/, which --configs takes."""
     return sorted(file.stem for file in SHIPPED.glob("*.json"))
 
@@ -29,13 +29,14 @@ def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
     path: of the file, or if there is none, the name of one in sets/, without its ending. parse: see `check_options`.
     UserError for any other content, or for words that train.py does not accept.
     """
-    if not path.is_file() and str(path) in shipped():
+    if not path.is_file() and str(path) in list_shipped():
         path = SHIPPED / f"{path}.json"
     try:
-        content = json.loads(plain_text(path), object_pairs_hook=_no_duplicates)
+        content = json.loads(plain_text(path), object_pairs_hook=_refuse_duplicates)
     except OSError as error:
         raise UserError(
-            f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}, or {' or '.join(shipped())}"
+            f"cannot read {path} ({error.strerror}); --configs takes a JSON file {_SHAPE}, or "
+            f"{' or '.join(list_shipped())}"
         ) from error
     except (ValueError, RecursionError) as error:
         raise UserError(f"{path} is not a table of option sets ({error}); write it {_SHAPE}") from error
@@ -55,7 +56,7 @@ def read_configs(path: Path, parse: Parse | None) -> dict[str, tuple[str, ...]]:
     return configs
 
 
-def _no_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
+def _refuse_duplicates(pairs: list[tuple[str, object]]) -> dict[str, object]:
     names = [name for name, _ in pairs]
     if twice := [name for name in names if names.count(name) > 1]:
         raise ValueError(f"it has {twice[0]} twice")

@@ -1,4 +1,4 @@
-"""What option sets gain: differences between trainings of the same seed, their intervals, and verdicts from these.
+"""Gains of option sets: differences between trainings of the same seed, their intervals, and verdicts from these.
 
 Runs of one seed share photos, order and start, so their difference varies less than each score does (common random
 numbers). Intervals are Student's t at 95 %; p values of several scenes are corrected by Holm's procedure (1979).
@@ -10,51 +10,51 @@ import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from applications.evaluation.comparison import Run, Sets, comparable_sets, default_set, grouped
+from applications.evaluation.comparison import Run, Sets, choose_default_set, find_comparable_sets, group_by
 
 LEVEL = 0.05
 SMALL = 0.2  # dB; an interval that ends below it says that there is no difference to speak of
 
 
-def gains(runs: Sequence[Run]) -> dict[str, Any]:
-    """The gains of each scene with several option sets and seeds.
+def compute_gains(runs: Sequence[Run]) -> dict[str, Any]:
+    """Compute the gains of each scene that has several option sets and seeds.
 
     By scene: `default`, the set that others are compared with, and `sets`, by name: `seeds`; `mean` and `half`, the
     mean gain in test PSNR (dB) and half of its interval, the smallest gain that so many seeds could have shown;
-    `p`, corrected over the scenes; and `verdict`.
+    `p`, corrected over the scenes; and `judge_gain`.
     """
     found: dict[str, dict[str, Any]] = {}
-    for scene in grouped(runs, "scene"):
-        sets = comparable_sets(runs, scene)
-        if sets and (rows := _paired(sets)):
-            found[scene] = {"default": default_set(sets), "sets": rows}
+    for scene in group_by(runs, "scene"):
+        sets = find_comparable_sets(runs, scene)
+        if sets and (rows := _pair_seeds(sets)):
+            found[scene] = {"default": choose_default_set(sets), "sets": rows}
     for name in dict.fromkeys(name for one in found.values() for name in one["sets"]):
         rows = [one["sets"][name] for one in found.values() if name in one["sets"]]
-        for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
+        for row, p in zip(rows, correct_holm([row["p"] for row in rows]), strict=True):
             row["p"] = p
-            row["verdict"] = verdict(row)
+            row["verdict"] = judge_gain(row)
     return found
 
 
-def _paired(sets: Sets) -> dict[str, dict[str, Any]]:
-    default = default_set(sets)
-    theirs = _ends(sets[default])
+def _pair_seeds(sets: Sets) -> dict[str, dict[str, Any]]:
+    default = choose_default_set(sets)
+    theirs = _final_psnr(sets[default])
     rows = {}
     for name, runs in sets.items():
-        own = _ends(runs)
+        own = _final_psnr(runs)
         seeds = [seed for seed in own if seed in theirs]
         if name != default and len(seeds) > 1:
-            rows[name] = {"seeds": len(seeds)} | interval([own[seed] - theirs[seed] for seed in seeds])
+            rows[name] = {"seeds": len(seeds)} | compute_interval([own[seed] - theirs[seed] for seed in seeds])
     return rows
 
 
-def _ends(runs: Sequence[Run]) -> dict[Any, float]:
+def _final_psnr(runs: Sequence[Run]) -> dict[Any, float]:
     """The test PSNR at the end, by seed."""
     ends = ((run["seed"], run["iterations"].get(str(run["final_iteration"]), {}).get("PSNR")) for run in runs)
     return {seed: psnr for seed, psnr in ends if psnr is not None}
 
 
-def interval(differences: Sequence[float]) -> dict[str, float]:
+def compute_interval(differences: Sequence[float]) -> dict[str, float]:
     """Mean and half of the 95 % interval of at least two differences, and the p value of no difference."""
     from scipy import stats  # imported here: it takes long, and most programs need none
 
@@ -65,7 +65,7 @@ def interval(differences: Sequence[float]) -> dict[str, float]:
     return {"mean": mean, "half": half, "p": p}
 
 
-def holm(p_values: Sequence[float]) -> list[float]:
+def correct_holm(p_values: Sequence[float]) -> list[float]:
     """P values corrected for their number, in their order (Holm 1979)."""
     corrected, least = [0.0] * len(p_values), 0.0
     for place, index in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
@@ -74,8 +74,8 @@ def holm(p_values: Sequence[float]) -> list[float]:
     return corrected
 
 
-def verdict(row: Mapping[str, float]) -> str:
-    """What mean, interval and p value say."""
+def judge_gain(row: Mapping[str, float]) -> str:
+    """Return a verdict in words by mean, interval and p value."""
     if row["p"] < LEVEL:
         return "gains" if row["mean"] > 0 else "costs"
     most = abs(row["mean"]) + row["half"]

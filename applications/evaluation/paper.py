@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from applications.evaluation.comparison import QUANTITIES
-from applications.evaluation.tables import Table, result_tables
+from applications.evaluation.tables import Table, make_result_tables
 from splatting.records.renders import SCORES
 
 SHOWN = (*SCORES, "seconds", "gaussians")  # as many as a column of text is wide
@@ -24,7 +24,7 @@ _ESCAPES = {
 }
 
 
-def csv_text(report: Mapping[str, Any]) -> str:
+def format_csv(report: Mapping[str, Any]) -> str:
     """A line for each scored iteration of each run, and for each row of means. Names are those of report.json.
 
     A run without scores has a line, too. scenes: 1, or the number of scenes that a mean is over. failed: the stage.
@@ -44,13 +44,15 @@ def csv_text(report: Mapping[str, Any]) -> str:
     return text.getvalue()
 
 
-def tex_text(report: Mapping[str, Any]) -> str:
+def format_tex(report: Mapping[str, Any]) -> str:
     r"""Tables to \input, with the lines of the package booktabs if the document loads it."""
-    tables = result_tables([*report["summary"], *report["means"]], SHOWN)
-    return "% \\input{report} in an article; finer lines with \\usepackage{booktabs}\n" + "".join(map(_tex, tables))
+    tables = make_result_tables([*report["summary"], *report["means"]], SHOWN)
+    return "% \\input{report} in an article; finer lines with \\usepackage{booktabs}\n" + "".join(
+        map(_format_table, tables)
+    )
 
 
-def _tex(table: Table) -> str:
+def _format_table(table: Table) -> str:
     columns = list(zip(table.header, *table.rows, strict=True))
     same = [column for column in columns if column[0] in _CONSTANT and len(set(column[1:])) == 1]
     header, *rows = zip(*(column for column in columns if column not in same), strict=True)
@@ -58,28 +60,28 @@ def _tex(table: Table) -> str:
     caption = f"Scores of the test views{said}."
     if any("±" in str(row) for row in rows):
         caption += " Means ± sample standard deviations over the seeds."
-    lines = [_line(row) for row in rows]
+    lines = [_join_cells(row) for row in rows]
     if "options" in header:  # which stand below their scene
         lines, header = [], header[1:]
         for scene, of_scene in itertools.groupby(rows, key=lambda row: row[0]):
             lines += ["\\midrule"] if lines else []
-            lines += [f"\\multicolumn{{{len(header)}}}{{l}}{{{_escaped(scene)}}} \\\\"]
-            lines += [_line(row[1:]) for row in of_scene]
+            lines += [f"\\multicolumn{{{len(header)}}}{{l}}{{{_escape_tex(scene)}}} \\\\"]
+            lines += [_join_cells(row[1:]) for row in of_scene]
     return "\n".join([
         "\\begin{table}", "\\footnotesize\\setlength{\\tabcolsep}{3pt}",
         *(f"\\providecommand{{\\{rule}}}{{\\hline}}" for rule in _RULES),
-        f"\\caption{{{_escaped(f'{caption} {table.title}')}}}\\medskip",
+        f"\\caption{{{_escape_tex(f'{caption} {table.title}')}}}\\medskip",
         # A wide one stands in both margins.
         f"\\makebox[\\linewidth]{{\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}",
-        "\\toprule", _line(header), "\\midrule", *lines, "\\bottomrule", "\\end{tabular}}", "\\end{table}", "",
+        "\\toprule", _join_cells(header), "\\midrule", *lines, "\\bottomrule", "\\end{tabular}}", "\\end{table}", "",
     ])  # fmt: skip
 
 
-def _line(cells: Sequence[str]) -> str:
-    return " & ".join(map(_escaped, cells)) + r" \\"
+def _join_cells(cells: Sequence[str]) -> str:
+    return " & ".join(map(_escape_tex, cells)) + r" \\"
 
 
-def _escaped(text: str) -> str:
+def _escape_tex(text: str) -> str:
     """A text as TeX shows it; letters that its first fonts lack appear as numbers."""
     plain = " ".join(text.split()).encode("latin-1", "backslashreplace").decode("latin-1")
     safe = "".join(_ESCAPES.get(x, x) for x in plain)

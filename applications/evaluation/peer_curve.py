@@ -59,7 +59,7 @@ def from_gsplat(folder: Path) -> list[Row]:
         saved = stats / f"{path.stem.replace('val', 'train', 1)}_rank0.json"
         if not saved.is_file():
             continue
-        scores, costs = _json(path), _json(saved)
+        scores, costs = _read_stats(path), _read_stats(saved)
         try:
             row = {"iteration": int(path.stem.removeprefix("val_step")) + 1, "seconds": float(costs["ellipse_time"])}
             row |= {"gaussians": int(costs["num_GS"]), "peak_memory_mib": 1024 * float(costs["mem"])}
@@ -74,7 +74,7 @@ def from_gsplat(folder: Path) -> list[Row]:
     return sorted(rows, key=lambda row: row["iteration"])
 
 
-def _json(path: Path) -> dict[str, Any]:
+def _read_stats(path: Path) -> dict[str, Any]:
     try:
         return json.loads(plain_text(path))
     except (OSError, ValueError) as error:
@@ -95,7 +95,7 @@ def from_log(path: Path) -> list[Row]:
     for line in lines:
         stamp = _STAMP.search(line)
         try:
-            now = _later(now, stamp) if stamp else now
+            now = _parse_later(now, stamp) if stamp else now
         except ValueError as error:
             raise UserError(
                 f"{path} has a line whose time does not exist: {stamp[0].strip()}; save it again"
@@ -110,10 +110,10 @@ def from_log(path: Path) -> list[Row]:
         row = rows.setdefault(int(tested[1]), {"iteration": int(tested[1])})
         row |= {f"{tested[2]}_l1": float(tested[3]), f"{tested[2]}_psnr": float(tested[4])}
         row.setdefault("seconds", max((now - begin).total_seconds(), 1.0))
-    return _scored(list(rows.values()), path)
+    return _make_rows(list(rows.values()), path)
 
 
-def _later(before: datetime | None, stamp: re.Match[str]) -> datetime:
+def _parse_later(before: datetime | None, stamp: re.Match[str]) -> datetime:
     """Time of a stamp, which has no year: not before `before`."""
     day, month, hour, minute, second = map(int, stamp.groups())
     now = datetime(before.year if before else 2000, month, day, hour, minute, second)
@@ -140,7 +140,7 @@ def from_events(folder: Path) -> list[Row]:
         row |= {"seconds": seconds[step]}
         if step in walls:
             row["wall_seconds"] = walls[step] - clock[0].wall_time + clock[0].step * clock[0].value / 1000
-    return _scored(list(rows.values()), folder)
+    return _make_rows(list(rows.values()), folder)
 
 
 def _training_seconds(clock: Sequence[ScalarEvent], scored: Sequence[int]) -> dict[int, float]:
@@ -181,14 +181,14 @@ def read_scalars(folder: Path) -> dict[str, list[ScalarEvent]]:
     return found
 
 
-def _scored(rows: Sequence[Row], source: Path) -> list[Row]:
+def _make_rows(rows: Sequence[Row], source: Path) -> list[Row]:
     scored = [row for row in rows if row.get("test_psnr") is not None]
     if not scored:
         raise UserError(f"{source} has no scores of test views; train with --eval and --test_iterations")
     return sorted(scored, key=lambda row: row["iteration"])
 
 
-def curve_of(kind: str, source: Path) -> tuple[list[Row], str]:
+def read_curve(kind: str, source: Path) -> tuple[list[Row], str]:
     """Read a peer's output, kind `gsplat` or `reference`; return its rows and what their seconds contain."""
     if not source.exists():
         raise UserError(f"there is no {source}; give the output of the other program")
@@ -212,7 +212,7 @@ def main() -> None:
                         "TensorBoard's files, or a file with what train.py printed")  # fmt: skip
     parser.add_argument("file", type=Path, metavar="FILE.csv", help="file to write")
     args = parser.parse_args()
-    rows, note = curve_of(args.kind, args.source)
+    rows, note = read_curve(args.kind, args.source)
     write_peer(args.file, rows)
     print(f"wrote {len(rows)} points to {args.file}; {note}")
 

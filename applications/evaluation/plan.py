@@ -140,13 +140,13 @@ class Run:
         return None if any(values[name].strip("0.") for name in ENDING) else values["iterations"]
 
 
-def photos_of(options: Sequence[str]) -> str:
-    """Say in a few words which photos words for train.py choose, and how these are made smaller."""
-    chosen = _photo_options(options)
+def describe_photos(options: Sequence[str]) -> str:
+    """Describe the photos that train.py's options choose, and the factor by which these are made smaller."""
+    chosen = _find_photo_options(options)
     return chosen.images if chosen.resolution == "-1" else f"{chosen.images}, resized by -r {chosen.resolution}"
 
 
-def _photo_options(words: Sequence[str]) -> argparse.Namespace:
+def _find_photo_options(words: Sequence[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("-i", "--images", default="images")
     parser.add_argument("-r", "--resolution", default="-1")
@@ -156,7 +156,7 @@ def _photo_options(words: Sequence[str]) -> argparse.Namespace:
 def check_photos(runs: Sequence[Run]) -> None:
     """Raise UserError if a scene of Mip-NeRF 360 lacks the folder of its smaller photos."""
     for run in runs:
-        images = _photo_options(run.options).images
+        images = _find_photo_options(run.options).images
         if run.scene.options[:1] == ("-i",) and not (run.scene.source / images).is_dir():
             raise UserError(
                 f"{run.scene.source} has no folder {images}; give --resize, which makes photos of images smaller, or "
@@ -259,7 +259,7 @@ def check_nesting(runs: Sequence[Run], output: Path) -> None:
 
 
 def is_model(folder: Path) -> bool:
-    """Whether a folder holds a model, or what full_eval.py has begun of one."""
+    """Tell if a folder holds a model, or one that full_eval.py has begun."""
     return (folder / RECORD).is_file() or (folder / "point_cloud").is_dir()
 
 

@@ -18,8 +18,8 @@ import numpy as np
 from markupsafe import Markup
 
 from applications.evaluation import comparison, tables
-from applications.evaluation.gains import gains
-from applications.evaluation.paper import csv_text, tex_text
+from applications.evaluation.gains import compute_gains
+from applications.evaluation.paper import format_csv, format_tex
 from groundwork.files.image_files import open_image
 from groundwork.files.json_files import write_json
 from groundwork.host.listing import markdown_table
@@ -58,12 +58,12 @@ def make_report(
     command: words of the command line; runs: results of `results.read_run`; peers: as `error_curve.peers_of` returns
     them; earlier_commands: those of calls that made other runs.
     """
-    runs = comparison.stand_apart(runs)
-    scenes = list(comparison.grouped(runs, "scene"))
+    runs = comparison.mark_apart(runs)
+    scenes = list(comparison.group_by(runs, "scene"))
     rows = sorted(comparison.summarise(runs), key=lambda row: scenes.index(row["scene"]))
-    means = comparison.scene_means(rows)
+    means = comparison.average_scenes(rows)
     return {
-        "gains": gains(runs),
+        "gains": compute_gains(runs),
         "manifest": {
             "command": list(command),
             "earlier_commands": [list(words) for words in earlier_commands if list(words) != list(command)],
@@ -75,14 +75,14 @@ def make_report(
         "published": comparison.compare(runs, rows, means),
         "runs": runs,
         "summary": rows,
-        "warnings": _warnings(runs, rows),
+        "warnings": _list_warnings(runs, rows),
     }
 
 
-def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
+def _list_warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the reasons why numbers of this report cannot be compared."""
     lines = []
-    for scene, members in comparison.grouped(runs, "scene").items():
+    for scene, members in comparison.group_by(runs, "scene").items():
         if len({run["ground_truth_sha256"] for run in members} - {None}) > 1:
             apart = dict.fromkeys(run["config"] or "-" for run in members if run["apart"])
             lines.append(
@@ -90,7 +90,7 @@ def _warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[str]:
                 "scores and curves cannot be compared. Left out of comparisons: "
                 f"{', '.join(apart)}."
             )
-        if shares := comparison.uneven_shares(members):
+        if shares := comparison.find_uneven_shares(members):
             lines.append(
                 f"{scene}: the trainings got {100 * shares[0]:.0f} to {100 * shares[1]:.0f} % of a processor. Where "
                 "they got less, other programs used the machine, or the option set leaves processors idle; compare CPU "
@@ -114,22 +114,26 @@ def _set_of(row: Mapping[str, Any]) -> str:
 
 def write_report(report: Mapping[str, Any], output: Path) -> None:
     """Write all files of the report into `output`."""
-    runs = comparison.grouped(report["runs"], "scene")
+    runs = comparison.group_by(report["runs"], "scene")
     shown = len({(run["scene"], run["config"]) for run in report["runs"]})
     each = max(1, min(OF_A_RUN, OF_A_REPORT // max(1, shown)))
     pictures, folder = {}, output / "figures"
     for scene, members in runs.items():
         peers = [peer for peer in report["peers"] if peer["scene"] == scene]
         pictures[scene] = {
-            "cameras": _figures(draw_cameras, folder, scene, _from_above(output, members)),
-            "curves": _figures(draw_curves, folder, scene, members, peers),
-            "poses": _figures(draw_poses, folder, scene, members),
-            "sizes": _figures(draw_sizes, folder, scene, members),
-            "masked": [path for run in members for path in _of_parts(output / run["model"])],
-            "views": _views(output, scene, members, each),
+            "cameras": _draw_figures(draw_cameras, folder, scene, _find_cameras(output, members)),
+            "curves": _draw_figures(draw_curves, folder, scene, members, peers),
+            "poses": _draw_figures(draw_poses, folder, scene, members),
+            "sizes": _draw_figures(draw_sizes, folder, scene, members),
+            "masked": [path for run in members for path in _list_pictures(output / run["model"])],
+            "views": _show_views(output, scene, members, each),
         }
     texts = {f"report.{kind}": render(kind, report, pictures, output) for kind in ("md", "html")}
-    texts |= {"report.csv": csv_text(report), "report.tex": tex_text(report), "timing.txt": _timing(report["runs"])}
+    texts |= {
+        "report.csv": format_csv(report),
+        "report.tex": format_tex(report),
+        "timing.txt": _format_timing(report["runs"]),
+    }
     write_json(output / "report.json", report)
     for name, text in texts.items():
         with atomic_write(output / name) as temporary:
@@ -137,7 +141,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _from_above(output: Path, runs: Sequence[Run]) -> dict[str, list[np.ndarray]]:
+def _find_cameras(output: Path, runs: Sequence[Run]) -> dict[str, list[np.ndarray]]:
     """Places and axes of the cameras in each split, for `draw_cameras`, of models whose cameras.json has them."""
     found: dict[str, list[np.ndarray]] = {}
     for run in runs:
@@ -153,12 +157,12 @@ def _from_above(output: Path, runs: Sequence[Run]) -> dict[str, list[np.ndarray]
     return found
 
 
-def _of_parts(model: Path) -> list[Path]:
-    """Pictures of a model folder that parts of its training have drawn."""
+def _list_pictures(model: Path) -> list[Path]:
+    """List the pictures of a model folder that parts of its training have drawn."""
     return [path for pictures in tools("pictures") for path in pictures(model) if path.is_file()]
 
 
-def _figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:
+def _draw_figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:
     """Draw figures; return their files, none if there is nothing to draw."""
     try:
         return draw(*content)
@@ -167,7 +171,7 @@ def _figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:
         return []
 
 
-def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dict[str, Any]]:
+def _show_views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dict[str, Any]]:
     """Show views of each option set's first run that succeeded, side by side where the ground truth is the same.
 
     Of each ground truth: `sheet`, the file with the worst views; `shown`, up to `each` views; `several` option sets.
@@ -177,7 +181,7 @@ def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dic
         if not run["failure"] and run["worst_views"]:
             first.setdefault(run["config"], run)
     groups = []
-    for alike in comparison.grouped(first.values(), "ground_truth_sha256").values():
+    for alike in comparison.group_by(first.values(), "ground_truth_sha256").values():
         name = f"{scene}_{alike[0]['config']}" if groups else scene
         path = output / "figures" / f"{name}_worst_views.png"
         try:
@@ -186,19 +190,19 @@ def _views(output: Path, scene: str, runs: Sequence[Run], each: int) -> list[dic
             groups.append({"sheet": path, "shown": views.shown(each), "several": len(alike) > 1,
                            "table": views.table()})  # fmt: skip
         except UserError as error:
-            titles = "; ".join(map(run_title, alike))
+            titles = "; ".join(map(name_run, alike))
             print(f"warning: no pictures of the test views of {titles}: {error}", file=sys.stderr)
     return groups
 
 
-def _timing(runs: Sequence[Run]) -> str:
+def _format_timing(runs: Sequence[Run]) -> str:
     """Return the wall-clock minutes of train.py for each group of scenes, as text."""
-    timed = comparison.grouped((run for run in runs if run["wall_seconds"] is not None), "group")
+    timed = comparison.group_by((run for run in runs if run["wall_seconds"] is not None), "group")
     minutes = {group: sum(run["wall_seconds"] for run in members) / 60 for group, members in timed.items()}
     return "".join(f"{group}: {value:.2f} minutes\n" for group, value in minutes.items())
 
 
-def run_title(run: Mapping[str, Any]) -> str:
+def name_run(run: Mapping[str, Any]) -> str:
     """Name a run by scene, option set and seed."""
     seed = None if run["seed"] is None else f"seed {run['seed']}"
     return ", ".join(part for part in (run["scene"], run["config"], seed) if part)
@@ -206,26 +210,27 @@ def run_title(run: Mapping[str, Any]) -> str:
 
 def render(kind: str, report: Mapping[str, Any], pictures: Pictures, folder: Path) -> str:
     """Render report.jinja as a page of a kind, "md" or "html". folder: of the page, for links."""
-    scenes = comparison.grouped(report["runs"], "scene")
-    environment(kind).globals["folder"] = folder
-    text = environment(kind).get_template("report.jinja").render(
-        facts=_facts(report), form=f"page.{kind}.jinja", gain=GAIN, pictures=pictures, report=report,
-        published=comparison.published_tables(), scenes=scenes, tables=tables, title=TITLE,
+    scenes = comparison.group_by(report["runs"], "scene")
+    make_environment(kind).globals["folder"] = folder
+    text = make_environment(kind).get_template("report.jinja").render(
+        facts=_collect_facts(report), form=f"page.{kind}.jinja", gain=GAIN, pictures=pictures, report=report,
+        published=comparison.read_published(), scenes=scenes, tables=tables, title=TITLE,
     )  # fmt: skip
     return (re.sub(r"\n{2,}", "\n\n", text) if kind == "md" else text).strip() + "\n"
 
 
 @functools.cache
-def environment(kind: str) -> jinja2.Environment:
-    """Make what renders the templates of a kind of page. Its global `folder` is that of the page."""
+def make_environment(kind: str) -> jinja2.Environment:
+    """Make the jinja2 environment for a kind of page, "md" or "html". Its global `folder` is that of the page."""
     made = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True, finalize=_escaped if kind == "md" else None,
+        trim_blocks=True, lstrip_blocks=True, finalize=_escape if kind == "md" else None,
     )  # fmt: skip
     made.filters |= {
-        "data_uri": _data_uri, "indented": _indented, "jpeg": _uri, "markdown": markdown, "no_list": _no_list,
-        "number": tables.number, "one_line": lambda text: Markup(" ".join(text.split())),
-        "relative": _relative, "run_title": run_title, "url": lambda path: quote(os.fsencode(path)),
+        "data_uri": _data_uri, "indented": _indent, "jpeg": _encode, "markdown": format_markdown,
+        "no_list": _escape_start, "number": tables.format_number,
+        "one_line": lambda text: Markup(" ".join(text.split())), "relative": _relative, "run_title": name_run,
+        "url": lambda path: quote(os.fsencode(path)),
     }  # fmt: skip
     return made
 
@@ -235,8 +240,8 @@ def _relative(made: jinja2.Environment, path: Path) -> str:
     return os.path.relpath(path, made.globals["folder"])
 
 
-def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
-    """What decides which remarks a page has."""
+def _collect_facts(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Collect the facts that decide which remarks a page has."""
     rows, runs = report["summary"], report["runs"]
 
     def known(name: str, key: str = "mean") -> bool:
@@ -248,22 +253,22 @@ def _facts(report: Mapping[str, Any]) -> dict[str, Any]:
         "machines": sorted({one_line(run["machine"]) for run in runs if run["machine"]}),
         "mipnerf360": any(run["group"] == "mipnerf360" for run in runs),
         "open_ended": any(row["open_ended"] for row in rows),
-        "said": _said(runs),
+        "said": _list_closing_lines(runs),
         "several_seeds": known("PSNR", "std"),
         "timed": known("seconds"),
         "unfinished": [run for run in runs if not run["finished"] and not run["failure"]],
-        "trainings": _trainings(runs),
+        "trainings": _count_trainings(runs),
         "without_lpips": bool(rows) and not known("LPIPS"),
     }
 
 
-def _said(runs: Sequence[Run]) -> list[tuple[str, str]]:
-    """List what only some trainings said at their ends: which, and the line; other numbers make no other line."""
+def _list_closing_lines(runs: Sequence[Run]) -> list[tuple[str, str]]:
+    """List the closing lines that only some trainings have, each with these trainings; lines may differ in numbers."""
     by_form: dict[str, dict[str, str]] = {}
     for run in runs:
         for line in run["lines"] or ():
             if not line.startswith(_WARNING):
-                by_form.setdefault(_NUMBER.sub("", line.replace(run["model"], "")), {})[run_title(run)] = line
+                by_form.setdefault(_NUMBER.sub("", line.replace(run["model"], "")), {})[name_run(run)] = line
     said = []
     for lines in by_form.values():
         if len(lines) < len(runs):
@@ -273,8 +278,8 @@ def _said(runs: Sequence[Run]) -> list[tuple[str, str]]:
     return said
 
 
-def _trainings(runs: Sequence[Run]) -> str:
-    """What the report is of, in a line."""
+def _count_trainings(runs: Sequence[Run]) -> str:
+    """Say in a line how many trainings, scenes, option sets and seeds the report covers."""
     parts = [f"{len(runs)} training{'s' if len(runs) > 1 else ''}"]
     for key, name in (("scene", "scenes"), ("config", "option sets"), ("seed", "seeds")):
         if (count := len({run[key] for run in runs})) > 1:
@@ -286,24 +291,24 @@ def _data_uri(path: Path) -> str:
     """Return a figure as a data: URI; large ones become JPEG."""
     content = path.read_bytes()
     if len(content) <= _PHOTOGRAPHIC:
-        return _uri(content, "png")
+        return _encode(content, "png")
     buffer = io.BytesIO()
     with open_image(path) as image:
         image.convert("RGB").save(buffer, "JPEG", quality=_QUALITY)
-    return _uri(buffer.getvalue())
+    return _encode(buffer.getvalue())
 
 
-def _uri(content: bytes, kind: str = "jpeg") -> str:
+def _encode(content: bytes, kind: str = "jpeg") -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-def markdown(table: tables.Table) -> Markup:
+def format_markdown(table: tables.Table) -> Markup:
     """A table in Markdown, its cells escaped."""
-    header, *rows = [[str(_escaped(cell)) for cell in row] for row in (table.header, *table.rows)]
+    header, *rows = [[str(_escape(cell)) for cell in row] for row in (table.header, *table.rows)]
     return Markup(markdown_table(header, rows))
 
 
-def _escaped(text: Any) -> Markup:
+def _escape(text: Any) -> Markup:
     """Escape a text for Markdown, so that names in it appear as they are: no link, no HTML, no second line."""
     if isinstance(text, Markup):
         return text
@@ -311,10 +316,10 @@ def _escaped(text: Any) -> Markup:
     return Markup(" ".join(safe.splitlines()))
 
 
-def _no_list(text: str) -> Markup:
-    """Let a paragraph be no heading and no list, whatever it begins with."""
+def _escape_start(text: str) -> Markup:
+    """Escape the start of a paragraph, so that Markdown takes it for no heading and no list."""
     return Markup(re.sub(r"^\s*([#+=~-])", r"\\\1", text))
 
 
-def _indented(texts: Sequence[str]) -> Markup:
+def _indent(texts: Sequence[str]) -> Markup:
     return Markup("\n".join(f"    {line}" for text in texts for line in text.splitlines()))

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from applications.evaluation.plan import Record, Run, SceneEntry, is_model, photos_of
+from applications.evaluation.plan import Record, Run, SceneEntry, describe_photos, is_model
 from applications.evaluation.stages import Failure, page_file
 from arguments import read_model_json
 from groundwork.files.json_files import read_json
@@ -37,7 +37,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     # With --skip_training, another program or other options than this command's may have made the model.
     known = record.key or (None if (model / "point_cloud").exists() else run.key)
     options = tuple(known["options"]) if known else ()
-    curve, best, page = _curve(model), None, page_file(model, output)
+    curve, best, page = _read_curve(model), None, page_file(model, output)
     if found := peak(curve):
         best = {"iteration": found[0]["iteration"], "test_psnr": found[0]["test_psnr"], "lost": found[1],
                 "gained": gain_since_peak(curve),
@@ -46,13 +46,13 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     views = {"final_iteration": None, "iterations": {}, "split": None, "test_sizes": [], "worst_views": [],
              "views": {"test": None, "train": None}}  # fmt: skip
     try:
-        iterations = {str(n): _iteration(model, n, curve) for n in saved}
+        iterations = {str(n): _read_iteration(model, n, curve) for n in saved}
         if saved:  # the process trained to the end
             both = {"process_seconds": trained.get("wall_seconds"), "cpu_seconds": trained.get("cpu_seconds")}
             iterations[str(saved[-1])] |= both
         last = max((int(n) for n, values in iterations.items() if values["views"]), default=None)
         views |= {"final_iteration": last, "iterations": iterations}
-        views |= {} if last is None else _views(model, last)
+        views |= {} if last is None else _read_views(model, last)
     except UserError as error:
         failure = failure or Failure("report", [], [str(error)])
     return views | {
@@ -71,7 +71,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "options": known and known["options"],
         "open_ended": (model / folder_of.SCHEDULE).is_file()
         or dataclasses.replace(run, options=options).iterations is None,
-        "photos": photos_of(known["options"]) if known else None,
+        "photos": describe_photos(known["options"]) if known else None,
         "page": os.path.relpath(page, output) if record.stage("html") and page.is_file() else None,
         "peak": best,
         "poses": [[r["seconds"], r[DEGREES], r[PERCENT]] for r in folder_of.logged(model).values() if DEGREES in r],
@@ -82,7 +82,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     }
 
 
-def _curve(model: Path) -> list[Row]:
+def _read_curve(model: Path) -> list[Row]:
     try:
         return folder_of.curve_of(model)
     except UserError as error:
@@ -90,7 +90,7 @@ def _curve(model: Path) -> list[Row]:
         return []
 
 
-def _views(model: Path, last: int) -> dict[str, Any]:
+def _read_views(model: Path, last: int) -> dict[str, Any]:
     """Return what is known of the test views of the last scored iteration.
 
     cameras.json lists all views, test views first, fully masked ones too. worst_views: those of the lowest PSNR, worst
@@ -101,14 +101,14 @@ def _views(model: Path, last: int) -> dict[str, Any]:
     held_out, cameras = view_names(truth), folder_of.json_or_none(model / "cameras.json")
     scores = folder_of.load_scores(model, f"ours_{last}")[1]["PSNR"]
     return {
-        "split": _split(model, cameras, len(held_out)),
+        "split": _split_views(model, cameras, len(held_out)),
         "test_sizes": [list(size) for size in sorted({image_size(truth / name) for name in held_out})],
         "views": {"test": len(scores), "train": len(cameras) - len(held_out) if isinstance(cameras, list) else None},
         "worst_views": worst_views(model, scores),
     }
 
 
-def _split(model: Path, cameras: Any, held_out: int) -> str | None:
+def _split_views(model: Path, cameras: Any, held_out: int) -> str | None:
     if rule := read_model_json(model).get("holdout"):
         return f"--holdout {rule}"
     try:
@@ -119,7 +119,7 @@ def _split(model: Path, cameras: Any, held_out: int) -> str | None:
     return f"every {HOLD}th by name" if names[:held_out] == by_name[::HOLD] else "the data set's own"
 
 
-def _iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
+def _read_iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, Any]:
     """Return the scores of metrics.py, time, size and memory at a saved iteration.
 
     gaussians: as trained, as published tables count; gaussians_saved: without those left out as unseen; ply_mb:
@@ -164,7 +164,7 @@ def read_earlier(output: Path) -> dict[str, Any]:
         return nothing
     try:
         report = read_json(path)
-        runs = [_run(content, output) for content in report["runs"]]
+        runs = [_restore_run(content, output) for content in report["runs"]]
         manifest = report["manifest"]
         return {
             "runs": {run.model: (run, failure) for run, failure in runs if is_model(run.model)},
@@ -179,7 +179,7 @@ def read_earlier(output: Path) -> dict[str, Any]:
         return nothing
 
 
-def _run(content: dict[str, Any], output: Path) -> tuple[Run, Failure | None]:
+def _restore_run(content: dict[str, Any], output: Path) -> tuple[Run, Failure | None]:
     source = content["source"]
     scene = SceneEntry(content["scene"], content["group"], source and Path(source))
     options, added = tuple(content["options"] or ()), tuple(content["added_options"] or ())

@@ -44,7 +44,7 @@ class StageFailed(Exception):
         self.failure = failure
 
 
-def _source_of(run: Run) -> str:
+def _read_source(run: Run) -> str:
     if (source := run.scene.source) is None or not source.is_dir():
         reason = f"no such scene folder: {source}" if source else f"no scene folder was given for {run.scene.name}"
         raise StageFailed(Failure("train", [], [reason]))
@@ -58,24 +58,24 @@ def train(run: Run, machine: dict[str, Any], child: Child) -> None:
     training then starts from the beginning. `plan.check_folders` has made sure that nothing in the model folder was
     made with other options.
     """
-    source, record = _source_of(run), Record(run.model)
-    if _trained(run, record):
+    source, record = _read_source(run), Record(run.model)
+    if _is_trained(run, record):
         return
     record.start(run.key)
-    there = _checkpoints(run)
+    there = _list_checkpoints(run)
     before = record.stage("train_interrupted") or {}
     before = before if before.get("checkpoint") in there else {}
-    command = _script("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
+    command = _script_path("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
     command += ["--no_last_checkpoint", *run.options]
     command += ("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ()
-    done = child(command, "training" + _from_where(before, record))
-    spent = _sum(before, done)
-    if done.status and (left := [name for name, stamp in _checkpoints(run).items() if stamp != there.get(name)]):
+    done = child(command, "training" + _describe_start(before, record))
+    spent = _sum_seconds(before, done)
+    if done.status and (left := [name for name, stamp in _list_checkpoints(run).items() if stamp != there.get(name)]):
         stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
         latest = max(left, key=_iteration_of)
         stops = {"stops": [*before.get("stops", []), _iteration_of(latest)]} if stopped else {}
         record.note("train_interrupted" if stopped else "train_failed", checkpoint=latest, **stops, **spent)
-    _expect_success("train", command, done)
+    _require_success("train", command, done)
     for stop in before.get("stops", ()):
         _remove_stop(run, stop)
     iterations = trained_iterations(run.model)
@@ -92,7 +92,7 @@ def _remove_stop(run: Run, iteration: int) -> None:
         (run.model / f"chkpnt{iteration}.pth").unlink(missing_ok=True)
 
 
-def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
+def _sum_seconds(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
     """Return the seconds of a training with those of its parts before; CPU seconds None if not known."""
     parts = {
         name: (before.get(name) if before else 0.0, getattr(done, name)) for name in ("wall_seconds", "cpu_seconds")
@@ -100,14 +100,14 @@ def _sum(before: dict[str, Any], done: Finished) -> dict[str, float | None]:
     return {name: None if None in both else round(sum(both), 3) for name, both in parts.items()}
 
 
-def _trained(run: Run, record: Record) -> bool:
+def _is_trained(run: Run, record: Record) -> bool:
     done = record.stage("train")
     if not done or run.iterations not in (None, *done["iterations"]):
         return False
     return all(saved_ply(run.model, iteration).is_file() for iteration in done["iterations"])
 
 
-def _checkpoints(run: Run) -> dict[str, list[int]]:
+def _list_checkpoints(run: Run) -> dict[str, list[int]]:
     """Return the names of checkpoints in the model folder before the last iteration, each with its `_stamp`."""
     found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:]) and path.is_file()]
     return {path.name: _stamp(path) for path in found if _iteration_of(path.name) < (run.iterations or math.inf)}
@@ -117,7 +117,7 @@ def _iteration_of(checkpoint: str) -> int:
     return int(checkpoint[6:-4])
 
 
-def _from_where(before: dict[str, Any], record: Record) -> str:
+def _describe_start(before: dict[str, Any], record: Record) -> str:
     if before:
         return f" from {before['checkpoint']}"
     if failed := record.stage("train_failed"):
@@ -128,7 +128,7 @@ def _from_where(before: dict[str, Any], record: Record) -> str:
     return ""
 
 
-def _saved(run: Run, stage: str) -> list[int]:
+def _list_saved(run: Run, stage: str) -> list[int]:
     if iterations := trained_iterations(run.model):
         return iterations
     raise StageFailed(Failure(stage, [], [f"{run.model} has no saved iteration; train it first"]))
@@ -138,7 +138,7 @@ def _source(run: Run) -> tuple[str, ...]:
     return ("-s", str(run.scene.source)) if run.scene.source else ()
 
 
-def _once(
+def _run_once(
     child: Child, record: Record, name: str, say: str, command: list[str], requested: dict[str, Any],
     found: Callable[[], dict[str, Any] | None], also: Callable[[], dict[str, Any]] = dict, **environment: str,
 ) -> None:  # fmt: skip
@@ -150,7 +150,7 @@ def _once(
     if noted and there is not None and {key: noted.get(key) for key in requested | there} == requested | there:
         return
     done, stage = child(command, say, **environment), name.partition("_")[0]
-    _expect_success(stage, command, done)
+    _require_success(stage, command, done)
     there = found()
     if there is None:
         raise StageFailed(Failure(stage, command, ["the scene has no test views, so there is nothing to score"]))
@@ -163,12 +163,12 @@ def render(run: Run, options: Sequence[str], child: Child) -> None:
 
     options: more words for render.py.
     """
-    for iteration in _saved(run, "render"):
-        command = _script("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
+    for iteration in _list_saved(run, "render"):
+        command = _script_path("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
         command += ["--skip_train", "--eval", "--quiet", *options]
         requested = {"model": _stamp(saved_ply(run.model, iteration)), "options": list(options)}
-        say, found = f"rendering iteration {iteration}", partial(_rendered, run.model, iteration)
-        _once(child, Record(run.model), f"render_{iteration}", say, command, requested, found)
+        say, found = f"rendering iteration {iteration}", partial(_count_rendered, run.model, iteration)
+        _run_once(child, Record(run.model), f"render_{iteration}", say, command, requested, found)
 
 
 def _stamp(file: Path) -> list[int]:
@@ -177,7 +177,7 @@ def _stamp(file: Path) -> list[int]:
     return [state.st_size, state.st_mtime_ns]
 
 
-def _rendered(model: Path, iteration: int) -> dict[str, int] | None:
+def _count_rendered(model: Path, iteration: int) -> dict[str, int] | None:
     """Return the number of rendered `views`; None if there are none, or a render or a ground truth is missing."""
     folder = model / "test" / f"ours_{iteration}"
     renders, truth = view_names(folder / "renders"), view_names(folder / "gt")
@@ -191,20 +191,20 @@ def score(run: Run, child: Child, download: bool = True, weights: Path | None = 
     answer takes 10 seconds.
     """
     record, model = Record(run.model), run.model
-    methods = [f"ours_{iteration}" for iteration in trained_iterations(model) if _rendered(model, iteration)]
+    methods = [f"ours_{iteration}" for iteration in trained_iterations(model) if _count_rendered(model, iteration)]
     if not methods:
         raise StageFailed(Failure("metrics", [], [f"{model} has no rendered test views; render them first"]))
     times = {method: model / "test" / method / TIMES for method in methods}  # render.py writes these last
     renders = {method: _stamp(path) if path.is_file() else None for method, path in times.items()}
-    if None in renders.values() or not _scored(model, methods):
+    if None in renders.values() or not _is_scored(model, methods):
         record.forget("metrics")
     before = record.stage("metrics")
     environment = {} if download else {"GS_DOWNLOAD": TOLD}
     given = {} if weights is None else {"weights": str(weights.resolve())}
     words = [f"--{name}={folder}" for name, folder in given.items()] + ["--stlpips"] * stlpips
     given |= {"stlpips": True} if stlpips else {}
-    command = _script("metrics.py", "-m", str(model), "--error_maps", *words)
-    _once(
+    command = _script_path("metrics.py", "-m", str(model), "--error_maps", *words)
+    _run_once(
         child, record, "metrics", "scoring", command, {"renders": renders, **given}, dict,
         lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,
     )  # fmt: skip
@@ -218,32 +218,32 @@ def page_file(model: Path, output: Path) -> Path:
     return output / "models" / f"{model.relative_to(output)}.html"
 
 
-def page(run: Run, output: Path, options: Sequence[str], child: Child) -> None:
+def write_page(run: Run, output: Path, options: Sequence[str], child: Child) -> None:
     """Write the last saved iteration as one HTML file, unless it was made of the same model.
 
     options: more words for export.py.
     """
-    last, file = _saved(run, "html")[-1], page_file(run.model, output)
+    last, file = _list_saved(run, "html")[-1], page_file(run.model, output)
     mkdir_p(file.parent)
-    command = _script("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
+    command = _script_path("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
     command += ["--to", str(file), "--raw", *options]  # what was scored
     requested = {"model": _stamp(saved_ply(run.model, last)), "options": list(options)}
     say = "writing the model as a page"
-    _once(child, Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
+    _run_once(child, Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
 
 
-def _scored(model: Path, methods: Sequence[str]) -> bool:
+def _is_scored(model: Path, methods: Sequence[str]) -> bool:
     try:
         return all(load_scores(model, method) for method in methods)
     except UserError:
         return False
 
 
-def _script(name: str, *words: str) -> list[str]:
+def _script_path(name: str, *words: str) -> list[str]:
     return [sys.executable, str(_ROOT / name), *words]
 
 
-def _expect_success(stage: str, command: list[str], done: Finished) -> None:
+def _require_success(stage: str, command: list[str], done: Finished) -> None:
     if not done.status:
         return
     _stop_if_asked(done)

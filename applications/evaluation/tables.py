@@ -39,27 +39,27 @@ class Table(NamedTuple):
     title: str = ""
 
 
-def number(value: float | None, digits: int) -> str:
+def format_number(value: float | None, digits: int) -> str:
     """Format a number for a cell; None becomes -."""
     return "-" if value is None else f"{value:,.{digits}f}"
 
 
-def spread_cell(spread: Mapping[str, Any], digits: int) -> str:
+def format_spread(spread: Mapping[str, Any], digits: int) -> str:
     """Format mean and standard deviation of a `comparison.spread`."""
-    return number(spread["mean"], digits) + ("" if spread["std"] is None else f" ± {spread['std']:,.{digits}f}")
+    return format_number(spread["mean"], digits) + ("" if spread["std"] is None else f" ± {spread['std']:,.{digits}f}")
 
 
-def table(columns: Mapping[str, Callable[[Any], str]], items: Sequence[Any], title: str = "") -> Table:
+def make_table(columns: Mapping[str, Callable[[Any], str]], items: Sequence[Any], title: str = "") -> Table:
     """Make a table with a row for each item. columns: heading and text of a cell."""
     return Table(list(columns), [[text(item) for text in columns.values()] for item in items], title)
 
 
-def _iteration(row: Mapping[str, Any]) -> str:
+def _format_iteration(row: Mapping[str, Any]) -> str:
     several = row.get("iterations", [])  # reports of older versions lack it
-    return f"{several[0]:,} to {several[-1]:,}" if len(several) > 1 else number(row["iteration"], 0)
+    return f"{several[0]:,} to {several[-1]:,}" if len(several) > 1 else format_number(row["iteration"], 0)
 
 
-def result_tables(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = tuple(QUANTITIES)) -> list[Table]:
+def make_result_tables(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = tuple(QUANTITIES)) -> list[Table]:
     """Tables of report.json's `summary` and `means`: rows that can be compared, and those that stand apart.
 
     names: the QUANTITIES to show.
@@ -68,29 +68,29 @@ def result_tables(rows: Sequence[Mapping[str, Any]], names: Sequence[str] = tupl
     comparable = [row for row in rows if not row.get("apart")]
     why = {f"{row['scene']}, {row['config'] or '-'}: {row.get('why_apart') or 'not known'}": None for row in apart}
     title = f"Scored on other ground truth, so not to be compared with other rows. {'. '.join(why)}."
-    return [_results(part, names, said) for part, said in ((comparable, ""), (apart, title)) if part]
+    return [_make_results_table(part, names, said) for part, said in ((comparable, ""), (apart, title)) if part]
 
 
-def _results(rows: Sequence[Mapping[str, Any]], names: Sequence[str], title: str) -> Table:
+def _make_results_table(rows: Sequence[Mapping[str, Any]], names: Sequence[str], title: str) -> Table:
     """A table without columns that are empty, but for PSNR and SSIM."""
     columns = {"scene": lambda row: row["scene"]}
     if any(row["config"] for row in rows):
         columns["options"] = lambda row: row["config"] or "-"
-    columns["iteration"] = _iteration
+    columns["iteration"] = _format_iteration
     for name in names:
         head, digits = QUANTITIES[name]
         if name in SCORES[:2] or any(row[name]["mean"] is not None for row in rows if name in row):
-            columns[head] = lambda row, name=name, digits=digits: spread_cell(row[name], digits)
+            columns[head] = lambda row, name=name, digits=digits: format_spread(row[name], digits)
     if any(row["seeds"] != [None] for row in rows):
-        columns["seeds"] = lambda row: _seeds(row["seeds"])
-    return table(columns, rows, title)
+        columns["seeds"] = lambda row: _format_seeds(row["seeds"])
+    return make_table(columns, rows, title)
 
 
-def _seeds(seeds: Sequence[int | None]) -> str:
+def _format_seeds(seeds: Sequence[int | None]) -> str:
     return " ".join("-" if seed is None else str(seed) for seed in seeds)
 
 
-def peers_table(peers: Sequence[Mapping[str, Any]]) -> Table:
+def make_peers_table(peers: Sequence[Mapping[str, Any]]) -> Table:
     """Table of the last points of other programs' curves."""
     columns = {
         "scene": lambda peer: peer["scene"],
@@ -98,63 +98,65 @@ def peers_table(peers: Sequence[Mapping[str, Any]]) -> Table:
         "points": lambda peer: str(len(peer["curve"])),
     }
     for name, (head, digits) in _LAST_OF_PEER.items():
-        columns[head] = lambda peer, name=name, digits=digits: number(peer["curve"][-1][name], digits)
-    return table({**columns, "file": lambda peer: peer["file"]}, peers)
+        columns[head] = lambda peer, name=name, digits=digits: format_number(peer["curve"][-1][name], digits)
+    return make_table({**columns, "file": lambda peer: peer["file"]}, peers)
 
 
-def published_table(compared: Sequence[Mapping[str, Any]]) -> Table:
+def make_published_table(compared: Sequence[Mapping[str, Any]]) -> Table:
     """Table of report.json's `published`."""
     columns = {
         "scene": lambda row: row["scene"],
         "table": lambda row: row["table"],
         "its GPU": lambda row: row["hardware"].removesuffix(" GPU"),
-        "iteration": lambda row: number(row["iteration"], 0),
+        "iteration": lambda row: format_number(row["iteration"], 0),
     }
     for name in COMPARED:
         head, digits = QUANTITIES[name]
         compares = name != "seconds"  # on different machines
         columns[f"{head}: ours, published" + compares * ", difference"] = (
-            lambda row, name=name, digits=digits, compares=compares: _beside(row["numbers"].get(name), digits, compares)
+            lambda row, name=name, digits=digits, compares=compares: _format_beside(
+                row["numbers"].get(name), digits, compares
+            )
         )
-    columns |= {"our photos": lambda row: row["photos"], "our options": _other_options}
-    return table(columns, compared)
+    columns |= {"our photos": lambda row: row["photos"], "our options": _format_other_options}
+    return make_table(columns, compared)
 
 
-def _other_options(row: Mapping[str, Any]) -> str:
+def _format_other_options(row: Mapping[str, Any]) -> str:
     added = row["other_options"]
     options = "not known" if added is None else " ".join(added) or "the table's"
     return f"{row['config']}: {options}" if row["config"] else options
 
 
-def _beside(values: Mapping[str, float] | None, digits: int, compares: bool) -> str:
+def _format_beside(values: Mapping[str, float] | None, digits: int, compares: bool) -> str:
     if values is None:
         return "-"
-    both = f"{number(values['ours'], digits)}, {number(values['published'], digits)}"
+    both = f"{format_number(values['ours'], digits)}, {format_number(values['published'], digits)}"
     return f"{both}, {values['difference']:+,.{digits}f}" if compares else both
 
 
-def gains_table(found: Mapping[str, Any]) -> Table:
+def make_gains_table(found: Mapping[str, Any]) -> Table:
     """Table of a scene's gains: a row for each option set but the one that others are compared with."""
     columns = {
         "options": lambda one: one[0],
-        "seeds": lambda one: number(one[1]["seeds"], 0),
+        "seeds": lambda one: format_number(one[1]["seeds"], 0),
         "gain (dB)": lambda one: f"{one[1]['mean']:+.2f} ± {one[1]['half']:.2f}",
         "verdict": lambda one: one[1]["verdict"],
     }
-    return table(columns, list(found["sets"].items()))
+    return make_table(columns, list(found["sets"].items()))
 
 
-def runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
+def make_runs_table(runs: Sequence[Mapping[str, Any]]) -> Table:
     """Table of what each run was given."""
     columns = {
         "model": lambda run: run["model"],
         "source": lambda run: run["source"] or "-",
         "photos": lambda run: run["photos"] or "not known",
-        "train views": lambda run: number(run["views"]["train"], 0),
-        "test views": lambda run: number(run["views"]["test"], 0),
+        "train views": lambda run: format_number(run["views"]["train"], 0),
+        "test views": lambda run: format_number(run["views"]["test"], 0),
         "split": lambda run: run["split"] or "not known",
         "test sizes": lambda run: " ".join(f"{width}x{height}" for width, height in run["test_sizes"]) or "-",
         "ground truth": lambda run: (run["ground_truth_sha256"] or "-")[:12],
         "train.py options": lambda run: " ".join(run["options"] or ["not known"]),
     }
-    return table(columns, runs)
+    return make_table(columns, runs)

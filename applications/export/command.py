@@ -22,16 +22,16 @@ import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 
-from applications.export.formats import FORMATS, Around, Format, format_of
+from applications.export.formats import FORMATS, Format, SceneInputs, find_format
 from applications.export.notes import read_notes
 from applications.export.reading import ANY, read_any
-from applications.export.upright import add_upright_options, check_upright, oriented_later, placed
+from applications.export.upright import add_upright_options, check_upright, follows_scene, move_upright
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from gaussian_renderer.camera_paths.without_scene import (
     WithoutScene,
-    circle,
-    record_of,
+    circle_cameras,
     recorded_cameras,
+    recorded_cameras_file,
     warn_if_moved,
 )
 from gaussian_renderer.importance import most_needed
@@ -58,7 +58,7 @@ if TYPE_CHECKING:  # SciPy takes a while to import
 
 FOR_PHONES = 500_000  # Gaussians of a page
 FEWEST = 100  # triangles that --triangles may ask for
-_DETAILS = "voxel", "triangles", "start", "title", "notes", "walk"  # of `Around`
+_DETAILS = "voxel", "triangles", "start", "title", "notes", "walk"  # of `SceneInputs`
 
 
 def load(
@@ -73,7 +73,7 @@ def load(
             "--max_splats, --clean, --walk and meshes need training views; give their model folder with -m, and beside "
             f"it --ply {args.ply}"
         )
-    record = record_of(options) if needs_views and not needs_photos else None
+    record = recorded_cameras_file(options) if needs_views and not needs_photos else None
     if needs_views and record is None:
         options.images_to_load = 1  # each image is used once or twice
         smooth = argparse.Namespace(antialiasing=bool(args.antialiasing))
@@ -103,9 +103,10 @@ def thin_out(
     options: argparse.Namespace,
     unscored: str,
 ) -> np.ndarray:
-    """Indices of the `count` Gaussians of the mask `keep` that the training views need most, the most needed first.
+    """Choose the `count` Gaussians of the mask `keep` that the training views need most.
 
-    Print the loss, if any go. unscored: why that is not known, empty: it is.
+    Prints the loss, if any Gaussians go. Returns indices, of the most needed Gaussian first.
+    unscored: reason why the loss is not known; empty: it is known.
     """
     every, cameras = scene.gaussians, scene.getTrainCameras()
     kept = np.flatnonzero(keep)
@@ -123,8 +124,8 @@ def thin_out(
     return kept[chosen.cpu().numpy()]
 
 
-def sky_of(model: str | None, means: np.ndarray) -> np.ndarray:
-    """(N,) bool: which Gaussians with centres (N, 3) are the sky of a model. UserError for a folder without one."""
+def find_sky(model: str | None, means: np.ndarray) -> np.ndarray:
+    """Return a mask (N,) of the Gaussians with centres (N, 3) that are a model's sky. UserError without a sky."""
     facts = read_model_json(Path(model)) if model else {}
     found = [mask for backdrop in tools("backdrop") if (mask := backdrop(facts, torch.from_numpy(means))) is not None]
     if not found:
@@ -132,10 +133,12 @@ def sky_of(model: str | None, means: np.ndarray) -> np.ndarray:
     return found[0].numpy()
 
 
-def cleaned(
+def find_needed(
     scene: Scene, most: float, pipe: argparse.Namespace, options: argparse.Namespace, picture: Path
 ) -> np.ndarray:
-    """(N,) bool: what the training views need, to within `most` dB each; print what goes, and write a picture of it."""
+    """Return a mask (N,) of the Gaussians that training views need, to within `most` dB each; print the rest.
+
+    picture: file for a picture of the removed Gaussians, None: none."""
     cleaning, views = clean_scene(scene, most, pipe, options.white_background)
     if not cleaning.keep.all():
         write_comparison(picture, scene.gaussians, cleaning.keep, scene.getTrainCameras(), views)
@@ -143,36 +146,36 @@ def cleaned(
     return cleaning.keep.cpu().numpy()
 
 
-def _picture_of_removed(to: str) -> Path:
+def _removed_picture(to: str) -> Path:
     return Path(to).with_name(f"{Path(to).name}.removed.png")
 
 
-def _cleaned_targets(args: argparse.Namespace) -> list[str]:
+def _list_cleaned_files(args: argparse.Namespace) -> list[str]:
     """The files that hold what --clean leaves, where there are photos."""
     by_itself = bool(args.model_path) and not args.raw
-    return [to for to in args.to if args.clean or (format_of(to).clean and by_itself)]
+    return [to for to in args.to if args.clean or (find_format(to).clean and by_itself)]
 
 
-def chooser(
+def make_chooser(
     args: argparse.Namespace,
     options: argparse.Namespace,
     pipe: argparse.Namespace,
     splats: Splats,
     scene: Scene | WithoutScene | None,
 ) -> Callable[[str], Splats]:
-    """What gives the splats of a file of --to. What several of them need is found once."""
+    """Make a function that chooses the splats of a file of --to; it computes once what several files need."""
     degree = used_sh_degree(splats) if args.typed_sh_degree is None else min(args.typed_sh_degree, splats.sh_degree)
     keep = choose(splats, args.crop, args.min_opacity)
     if args.no_sky:
-        keep &= ~sky_of(args.model_path, splats.means)
-    of_cleaned = _cleaned_targets(args) if isinstance(scene, Scene) else []
+        keep &= ~find_sky(args.model_path, splats.means)
+    of_cleaned = _list_cleaned_files(args) if isinstance(scene, Scene) else []
     unscored = "" if isinstance(scene, Scene) else "the photos are gone"
     unscored = "photos show more than the crop" if args.crop else unscored
 
     @functools.cache
     def needed(clean: bool) -> np.ndarray:
         most = args.clean or CLEAN_OPTION["const"]
-        return keep & cleaned(scene, most, pipe, options, _picture_of_removed(of_cleaned[0])) if clean else keep
+        return keep & find_needed(scene, most, pipe, options, _removed_picture(of_cleaned[0])) if clean else keep
 
     @functools.cache
     def chosen(clean: bool, thin: bool) -> Splats:
@@ -181,7 +184,7 @@ def chooser(
         return tidy(with_sh_degree(selected(splats, rows), degree))
 
     def splats_for(to: str) -> Splats:
-        clean, in_order = to in of_cleaned, format_of(to).in_order
+        clean, in_order = to in of_cleaned, find_format(to).in_order
         return chosen(clean, bool(args.max_splats and (in_order or needed(clean).sum() > args.max_splats)))
 
     return splats_for
@@ -189,48 +192,52 @@ def chooser(
 
 def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse.Namespace) -> None:
     """Write the files that the command line asks for. UserError if there is nothing to load or to write."""
-    entries = [format_of(to) for to in args.to]
+    entries = [find_format(to) for to in args.to]
     _check_fitting(args, entries)
-    make_path = _path_maker(args.path)
+    make_path = _make_path_maker(args.path)
     for to, entry in zip(args.to, entries, strict=True):
         if "spz_version" not in entry.options or args.spz_version in (None, WRITTEN[0]):
             entry.check(to)
         _refuse_to_replace_a_model(Path(to), args.ply)
     check_upright(args)
-    for to in _cleaned_targets(args)[:1]:
-        refuse_foreign(_picture_of_removed(to))
-    needs_views = bool(args.max_splats or args.clean or args.walk) or oriented_later(args)
+    for to in _list_cleaned_files(args)[:1]:
+        refuse_foreign(_removed_picture(to))
+    needs_views = bool(args.max_splats or args.clean or args.walk) or follows_scene(args)
     needs_views |= any(entry.of_scene and (args.model_path or not entry.around) for entry in entries)
     splats, scene = load(args, options, needs_views, needs_photos=bool(args.clean))
-    if isinstance(scene, WithoutScene) and _cleaned_targets(args):
+    if isinstance(scene, WithoutScene) and _list_cleaned_files(args):
         print(f"not cleaned, as there is no scene folder {options.source_path}; name it with -s", file=sys.stderr)
     if scene:
         _check_views(args, make_path, scene.getTrainCameras())
-    splats_for = chooser(args, options, pipe, splats, scene)
+    splats_for = make_chooser(args, options, pipe, splats, scene)
     if getattr(pipe, "projection", "ewa") == "ray":
         print("The model was trained with --projection ray; other programs draw large Gaussians off axis differently")
     background = (1.0, 1.0, 1.0) if options.white_background else (0.0, 0.0, 0.0)
-    in_place: dict[tuple[int, bool], tuple[Splats, Around | None]] = {}
+    in_place: dict[tuple[int, bool], tuple[Splats, SceneInputs | None]] = {}
     for to, entry in zip(args.to, entries, strict=True):
         chosen = splats_for(to)
         start = time.perf_counter()
         if (key := (id(chosen), entry.of_scene)) not in in_place:
             around = None
             if entry.of_scene:
-                cameras = scene.getTrainCameras() if scene else circle(chosen.means)
+                cameras = scene.getTrainCameras() if scene else circle_cameras(chosen.means)
                 details = {name: getattr(args, name) for name in _DETAILS}
-                around = Around(cameras, background, pipe, make_path, **details, made={})
-            in_place[key] = placed(args, entry.of_scene, chosen, around)
+                around = SceneInputs(cameras, background, pipe, make_path, **details, made={})
+            in_place[key] = move_upright(args, entry.of_scene, chosen, around)
         chosen, around = in_place[key]
         how = [around] if around else [args.spz_version or WRITTEN[0]] if "spz_version" in entry.options else []
         what = entry.write(to, chosen, *how)
-        print(f"Wrote {to}: {_told(to, entry, what, chosen, splats, args)}, {time.perf_counter() - start:.1f} s")
+        print(
+            f"Wrote {to}: {_describe_file(to, entry, what, chosen, splats, args)}, {time.perf_counter() - start:.1f} s"
+        )
         if "walk" in entry.options and len(chosen) > FOR_PHONES:
             print(f"Phones show up to {FOR_PHONES:,} Gaussians smoothly; make a page for them by --max_splats")
 
 
-def _told(to: str, entry: Format, what: str | None, chosen: Splats, splats: Splats, args: argparse.Namespace) -> str:
-    """What a file is, and its size. what: as its writer says, None: splats."""
+def _describe_file(
+    to: str, entry: Format, what: str | None, chosen: Splats, splats: Splats, args: argparse.Namespace
+) -> str:
+    """Describe a written file and its size. what: the writer's own description; None: the file has splats."""
     size = Path(to).stat().st_size
     if what is not None:
         return f"{what}, {size / 1e6:.2f} MB"
@@ -268,22 +275,22 @@ def _check_views(
 
     A warning if the views are not those of the training.
     """
-    from applications.export.page_start import check_note, named
+    from applications.export.page_start import check_note, find_named
     from gaussian_renderer.camera_paths.poses import poses_of  # SciPy takes a while to import
 
     if not args.ply:
         warn_if_moved(args.model_path, cameras)
     names = [str(camera.image_name) for camera in cameras]
     if args.start is not None:
-        named(args.start, names, f"--start {args.start}")
+        find_named(args.start, names, f"--start {args.start}")
     for note in read_notes(args.notes).views if args.notes else ():
         check_note(note, cameras)
     if make_path and cameras:
         make_path(poses_of(cameras))
 
 
-def _path_maker(path: str | None) -> Callable[[Poses], TimedPath] | None:
-    """What makes the animation of a page; None: the page's own."""
+def _make_path_maker(path: str | None) -> Callable[[Poses], TimedPath] | None:
+    """Make a function that makes the animation of a page; None: the page's own."""
     if path is None:
         return None
     from gaussian_renderer.camera_paths.render_path import path_maker

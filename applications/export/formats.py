@@ -15,7 +15,7 @@ from applications.export.mesh_files import (
     check_obj_mesh,
     check_usdz_mesh,
     find_packages,
-    with_z_up,
+    turn_z_up,
     write_glb_mesh,
     write_obj_mesh,
     write_ply_mesh,
@@ -38,8 +38,8 @@ if TYPE_CHECKING:  # SciPy takes a while to import
     from gaussian_renderer.camera_paths.poses import Poses
 
 
-class Around(NamedTuple):
-    """What the formats of a scene take besides its splats."""
+class SceneInputs(NamedTuple):
+    """Inputs of the formats of a scene besides its splats."""
 
     cameras: Sequence[Camera]  # the training views
     background: tuple[float, float, float]  # RGB in [0, 1]
@@ -65,13 +65,20 @@ class Around(NamedTuple):
 
 @dataclass(frozen=True)
 class Format:
-    """A format. ending: of its files' names; what: for people.
+    """A format of files.
 
-    write: writes a file of splats, whole or not at all, and returns what it is, where it is not splats. UserError if it
-    cannot be written. of_scene: it also takes `Around`. options: of export.py that are for this kind of files only.
-    around: views from around a model do, where there is no scene. clean: it is cleaned unless --raw is given. bands: it
-    keeps SH bands. in_order: it keeps the order of rows. check: raises UserError if a package or program that the file
-    needs is missing, or if a file of the user is in the way of one that is written beside it.
+    ending: of the files' names.
+    what: for people.
+    write: writes a file of splats, whole or not at all; returns a description of the file, None if it has splats.
+        UserError if the file cannot be written.
+    of_scene: `write` also takes `SceneInputs`.
+    options: of export.py that are for this kind of files only.
+    around: views from around a model do, where there is no scene.
+    clean: the model is cleaned unless --raw is given.
+    bands: the file keeps SH bands.
+    in_order: the file keeps the order of rows.
+    check: raises UserError if a package or program that the file needs is missing, or if a file of the user is in the
+        way of one that is written beside it.
     """
 
     ending: str
@@ -86,38 +93,38 @@ class Format:
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
-def _picture_of(page: str | os.PathLike) -> Path:
+def _preview_path(page: str | os.PathLike) -> Path:
     return Path(page).with_name(f"{Path(page).name}.jpg")  # no photo has such a name
 
 
-def _write_html(path: str | os.PathLike, splats: Splats, around: Around) -> None:
+def _write_html(path: str | os.PathLike, splats: Splats, around: SceneInputs) -> None:
     from applications.export.html import write_html  # SciPy and jinja2 take a while to import
     from applications.export.notes import read_notes
-    from applications.export.page_start import named, write_preview
+    from applications.export.page_start import find_named, write_preview
     from gaussian_renderer.camera_paths.start import best_start
 
     solid = None
     if around.walk:
-        from applications.export.walking import solid_of, walkable
+        from applications.export.walking import make_solid, make_walkable
 
-        splats, around = around.once("walkable", walkable, splats, around)
-        solid = around.once("solid", solid_of, splats, around.cameras, around.pipe)
+        splats, around = around.once("walkable", make_walkable, splats, around)
+        solid = around.once("solid", make_solid, splats, around.cameras, around.pipe)
     notes = read_notes(around.notes) if around.notes else None
     names = [str(camera.image_name) for camera in around.cameras]
     if around.start is not None:
-        start = named(around.start, names, f"--start {around.start}")
+        start = find_named(around.start, names, f"--start {around.start}")
     elif notes and notes.views:
-        start = named(notes.views[0].camera, names, f"--notes: {notes.views[0].camera}")
+        start = find_named(notes.views[0].camera, names, f"--notes: {notes.views[0].camera}")
     else:
         start = best_start(poses_of(around.cameras)) if names else 0
-    picture = _picture_of(path)
+    picture = _preview_path(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
     how = *how, around.upright, around.metric, notes, solid, around.pipe, around.once
     write_html(path, splats, around.cameras, *how)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
-def _mesh(
+def _mesh_format(
     ending: str,
     write: Callable[[str | os.PathLike, Mesh, Splats], None],
     what: str,
@@ -126,24 +133,24 @@ def _mesh(
 ) -> Format:
     """A format of meshes, with a texture or with colours of vertices."""
 
-    def write_mesh(path: str | os.PathLike, splats: Splats, around: Around) -> str:
-        from applications.export.mesh import measure, mesh_of  # as does this
+    def write_mesh(path: str | os.PathLike, splats: Splats, around: SceneInputs) -> str:
+        from applications.export.mesh import make_mesh, measure_surfaces  # as does this
 
-        measured = around.once("surfaces", measure, splats, around.cameras, around.pipe, around.voxel)
-        mesh, text = around.once(with_texture, mesh_of, *measured, around.triangles, with_texture)
-        write(path, with_z_up(mesh) if around.upright and not with_texture else mesh, splats)
+        measured = around.once("surfaces", measure_surfaces, splats, around.cameras, around.pipe, around.voxel)
+        mesh, text = around.once(with_texture, make_mesh, *measured, around.triangles, with_texture)
+        write(path, turn_z_up(mesh) if around.upright and not with_texture else mesh, splats)
         return text
 
     return Format(ending, write_mesh, what, True, ("voxel", "triangles"), bands=False, check=check)
 
 
-def _write_tileset(path: str | os.PathLike, splats: Splats, around: Around, compressed: bool = False) -> str:
+def _write_tileset(path: str | os.PathLike, splats: Splats, around: SceneInputs, compressed: bool = False) -> str:
     from applications.export.tiles3d import write_tileset  # as it imports the rasterizer
 
     return write_tileset(path, splats, around, compressed)
 
 
-def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: Around) -> str:
+def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: SceneInputs) -> str:
     from applications.export.streamed import write_lod_meta  # as it imports the rasterizer, too
 
     return write_lod_meta(path, splats, around)
@@ -151,10 +158,10 @@ def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: Around) -> 
 
 # An ending that ends with another one comes before it.
 FORMATS = (
-    _mesh("mesh.ply", write_ply_mesh, "surfaces, as coloured triangles", with_texture=False),
-    _mesh("mesh.glb", write_glb_mesh, "surfaces with a texture, as glTF"),
-    _mesh("mesh.obj", write_obj_mesh, "the same, with .mtl and .png beside it", check_obj_mesh),
-    _mesh("mesh.usdz", write_usdz_mesh, "the same, as OpenUSD", check_usdz_mesh),
+    _mesh_format("mesh.ply", write_ply_mesh, "surfaces, as coloured triangles", with_texture=False),
+    _mesh_format("mesh.glb", write_glb_mesh, "surfaces with a texture, as glTF"),
+    _mesh_format("mesh.obj", write_obj_mesh, "the same, with .mtl and .png beside it", check_obj_mesh),
+    _mesh_format("mesh.usdz", write_usdz_mesh, "the same, as OpenUSD", check_usdz_mesh),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "float32, everything kept", in_order=True),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
@@ -182,12 +189,12 @@ FORMATS = (
         ("path", "start", "title", "notes", "walk", "raw"),
         around=True,
         clean=True,
-        check=lambda path: refuse_foreign(_picture_of(path)),
+        check=lambda path: refuse_foreign(_preview_path(path)),
     ),
 )
 
 
-def format_of(path: str | os.PathLike) -> Format:
+def find_format(path: str | os.PathLike) -> Format:
     """The format of a file's name. UserError for an ending that is none of the table's."""
     name = os.fspath(path).lower()
     for entry in FORMATS:

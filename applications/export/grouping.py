@@ -11,9 +11,9 @@ from scene.splats.splats import Splats, base_colors
 _FARTHEST = 3.0  # places count up to so many median distances from the middle, so that far ones do not set the axis
 
 
-def groups_of(splats: Splats, size: int) -> tuple[np.ndarray, np.ndarray]:
+def group_splats(splats: Splats, size: int) -> tuple[np.ndarray, np.ndarray]:
     """An order (N,) of the splats, and where in it groups start (G,): ceil(N / size) groups, of at most `size`."""
-    axes = _axes(splats)
+    axes = _make_features(splats)
     order, starts = np.arange(len(splats)), np.zeros(1, np.int64)
     groups = np.array([-(-len(splats) // size)])  # that a part will have
     while (groups > 1).any():
@@ -30,8 +30,8 @@ def groups_of(splats: Splats, size: int) -> tuple[np.ndarray, np.ndarray]:
     return order, starts
 
 
-def _axes(splats: Splats) -> np.ndarray:
-    """What a Gaussian is told from others by, (N, 6) float64: its place, relative to the others, and colour."""
+def _make_features(splats: Splats) -> np.ndarray:
+    """Return the features (N, 6) float64 by which Gaussians are grouped: relative place, and colour."""
     apart = splats.means.astype(np.float64) - np.median(splats.means, axis=0)
     unit = np.median(np.abs(apart).max(axis=1)) or 1.0
     return np.hstack([np.clip(apart / unit, -_FARTHEST, _FARTHEST), np.clip(base_colors(splats), 0, 1)])

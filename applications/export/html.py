@@ -20,10 +20,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from applications.export.notes import Note, Notes
-from applications.export.page_start import named
+from applications.export.page_start import find_named
 from applications.export.vendor import FOLDER, RECORD, VIEWER
 from gaussian_renderer.camera_paths.keyframes import TimedPath
-from gaussian_renderer.camera_paths.poses import Poses, facing, focus_point, keyframe, poses_of, ray_through, unit
+from gaussian_renderer.camera_paths.poses import Poses, focus_point, keyframe, look_along, poses_of, ray_through, unit
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.median_depth import median_at
 from groundwork.files.json_files import read_json
@@ -91,30 +91,30 @@ def write_html(
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
     poses = poses_of(cameras)
-    turn, names = np.eye(3) if upright else turn_upright(up_of(poses)), [str(camera.image_name) for camera in cameras]
+    turn, names = np.eye(3) if upright else turn_upright(find_up(poses)), [str(camera.image_name) for camera in cameras]
+    track = make_path(poses) if make_path else None
     # Of the Gaussians from the page's first camera, median.
-    camera_path = make_path(poses) if make_path else None
     distance = float(np.median(np.linalg.norm(splats.means - poses.positions[start], axis=1))) if len(splats) else 1.0
     notes, aspects = notes or Notes(), [camera.image_width / camera.image_height for camera in cameras]
     pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": splats.antialiasing}))
-    depth = float(np.median(_depths(poses, focus_point(poses), distance)))
-    thing = partial(_thing, model_of(splats), cameras, pipe) if notes.views else None
+    depth = float(np.median(_find_turning_depths(poses, focus_point(poses), distance)))
+    thing = partial(_find_noted_point, model_of(splats), cameras, pipe) if notes.views else None
     page = {
         "antialiasing": splats.antialiasing,
         "aspect": aspects[start],
         "name": _NAME,
-        "limits": limits(poses, _VIEWER_AXES @ turn, depth),
+        "limits": find_limits(poses, _VIEWER_AXES @ turn, depth),
         "metre": 1.0 if metric else depth / _USUAL_DEPTH,
         "solid": solid and {"address": SOLID, "about": solid.about},
-        "settings": settings(poses, names, turn, camera_path, background, distance, start, aspects, notes.views, thing),
+        "settings": make_settings(poses, names, turn, track, background, distance, start, aspects, notes.views, thing),
     }
-    content = _template().render(
+    content = _read_template().render(
         background=", ".join(f"{255 * value:.0f}" for value in background),
-        model=once("packed", lambda: _packed_model(rotated(splats, turn))),
+        model=once("packed", lambda: _pack_model(rotated(splats, turn))),
         notes=notes,
         picture=picture,
         page=json.dumps(page, allow_nan=False).replace("<", "\\u003c"),  # no text in it may end its script element
-        solid=_in_base64(gzip.compress(solid.content, mtime=0)) if solid else "",
+        solid=_encode_base64(gzip.compress(solid.content, mtime=0)) if solid else "",
         title=(notes.title or Path(path).stem) if title is None else title,
     )
     with atomic_write(path) as temporary:
@@ -122,23 +122,23 @@ def write_html(
         temporary.write_text(content, encoding="utf-8", errors="backslashreplace")
 
 
-def _template() -> jinja2.Template:
-    """The page's, with the viewer."""
+def _read_template() -> jinja2.Template:
+    """Read the template of the page, with the viewer."""
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
     texts = {name: (FOLDER / file).read_text(encoding="utf-8") for name, file in _TEXTS.items()}
-    viewer = _in_base64((FOLDER / VIEWER).read_bytes())
+    viewer = _encode_base64((FOLDER / VIEWER).read_bytes())
     return environment.get_template("page.html.jinja", globals=dict(texts, record=read_json(RECORD), viewer=viewer))
 
 
-def _in_base64(content: bytes) -> str:
+def _encode_base64(content: bytes) -> str:
     return base64.b64encode(content).decode()
 
 
-def _packed_model(splats: Splats) -> str:
+def _pack_model(splats: Splats) -> str:
     content = io.BytesIO()
     packed_ply(splats).write(content)
-    packed = _in_base64(gzip.compress(content.getbuffer(), mtime=0))
+    packed = _encode_base64(gzip.compress(content.getbuffer(), mtime=0))
     if len(packed) > LONGEST:
         raise UserError(
             f"a page of {len(splats):,} Gaussians of SH degree {splats.sh_degree} would have {len(packed) / 1e6:.0f} "
@@ -147,7 +147,7 @@ def _packed_model(splats: Splats) -> str:
     return packed
 
 
-def up_of(poses: Poses) -> np.ndarray:
+def find_up(poses: Poses) -> np.ndarray:
     """The direction (3,), of length 1, that is up for most cameras: the one in which their rolls are least.
 
     A level camera has its x axis at right angles to up, however far it looks down. So up is the eigenvector of the
@@ -168,7 +168,7 @@ def turn_upright(up: np.ndarray) -> np.ndarray:
     return Rotation.from_rotvec(axis * np.arctan2(sine, cosine)).as_matrix()
 
 
-def settings(
+def make_settings(
     poses: Poses,
     names: Sequence[str],
     turn: np.ndarray,
@@ -191,14 +191,19 @@ def settings(
     aspects = aspects or [1.0] * len(poses)
     axes = _VIEWER_AXES @ turn
     focus = focus_point(poses)
-    depths = _depths(poses, focus, distance)
-    cameras = [_look(axes, *camera) for camera in zip(poses.positions, poses.turns, depths, poses.fov, strict=True)]
+    depths = _find_turning_depths(poses, focus, distance)
+    cameras = [
+        _make_camera(axes, *camera) for camera in zip(poses.positions, poses.turns, depths, poses.fov, strict=True)
+    ]
     if notes:
-        marked = [(named(note.camera, names, f"--notes: {note.camera}"), note.name, note.text) for note in notes]
+        marked = [(find_named(note.camera, names, f"--notes: {note.camera}"), note.name, note.text) for note in notes]
     else:
         chosen = np.unique(np.linspace(0, len(cameras) - 1, BOOKMARKS).round().astype(int)).tolist()
         marked = [(n, f"View {place} of {len(chosen)}", "") for place, n in enumerate(chosen, 1)]
-    marks = [_bookmark(title, text, cameras[n], lean(axes @ poses.turns[n]), aspects[n]) for n, title, text in marked]
+    marks = [
+        _make_bookmark(title, text, cameras[n], measure_lean(axes @ poses.turns[n]), aspects[n])
+        for n, title, text in marked
+    ]
     if notes:  # stand at the things, where the viewer shows their texts
         for mark, note, (n, _, _) in zip(marks, notes, marked, strict=True):
             mark["position"] = (axes @ thing(note, n, depths[n])).tolist()
@@ -208,36 +213,36 @@ def settings(
         "highPrecisionRendering": False,
         "background": {"color": list(background)},
         "postEffectSettings": _NO_EFFECTS,
-        "animTracks": [] if path is None else [_track(path, axes, float(np.median(depths)))],
+        "animTracks": [] if path is None else [_make_track(path, axes, float(np.median(depths)))],
         "cameras": [{"initial": cameras[start]}],
         "annotations": marks,
         "startMode": "default" if path is None else "animTrack",
     }
 
 
-def _depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarray:
-    """How far along each axis the point about which that camera turns lies: at the focus, or near it."""
+def _find_turning_depths(poses: Poses, focus: np.ndarray | None, distance: float) -> np.ndarray:
+    """Return the depth (N,) of the point about which each camera turns, along its axis: at the focus, or near it."""
     if focus is None:
         return np.full(len(poses), max(poses.spread or distance, 1e-3))
     ahead = ((focus - poses.positions) * poses.forward).sum(axis=1)
     return np.where(ahead > 0, ahead, np.median(ahead))
 
 
-def _thing(
+def _find_noted_point(
     gaussians: GaussianModel, cameras: Sequence[Camera], pipe: argparse.Namespace, note: Note, row: int, usual: float
 ) -> np.ndarray:
     """The point (3,) that a note of a camera means: on the surface, or as far away as is usual where there is none."""
     camera, pose = cameras[row], poses_of([cameras[row]])
     ray = ray_through(camera, *note.at) if note.at else np.zeros(3)
     ray = unit(ray) if ray.any() else pose.forward[0]
-    key = keyframe(0.0, pose.positions[0], facing(ray, -pose.turns[0, :, 1]), pose.fov[0])
+    key = keyframe(0.0, pose.positions[0], look_along(ray, -pose.turns[0, :, 1]), pose.fov[0])
     size = camera.image_width | 1, camera.image_height | 1  # so that the ray is in the middle of a pixel
     view = free_view(*size, np.radians(key.fov), key.position, key.wxyz, gaussians.get_xyz.device)
     return pose.positions[0] + (median_at(view, gaussians, pipe, size[0] // 2, size[1] // 2) or usual) * ray
 
 
-def limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:
-    """Opposite corners, in the viewer's world, of where guests may go: the cameras' box, and somewhat beyond it.
+def find_limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:
+    """Return opposite corners, in the viewer's world, of the box for guests: the cameras' box and a margin.
 
     depth: of what the cameras look at.
     """
@@ -246,7 +251,7 @@ def limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:
     return [(places.min(axis=0) - room).tolist(), (places.max(axis=0) + depth * _ASIDE).tolist()]
 
 
-def lean(turn: np.ndarray) -> float:
+def measure_lean(turn: np.ndarray) -> float:
     """Degrees by which a camera with axes `turn` (3,3) in the viewer's world must be rolled from a level one.
 
     About its backward axis, and level as the viewer's cameras are: turned about y, then about their own x.
@@ -256,12 +261,12 @@ def lean(turn: np.ndarray) -> float:
     return float(np.degrees(np.arctan2(turn[:, 1] @ level, turn[:, 0] @ level)))
 
 
-def _look(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float, fov: float) -> dict[str, Any]:
+def _make_camera(axes: np.ndarray, position: np.ndarray, turn: np.ndarray, depth: float, fov: float) -> dict[str, Any]:
     target = position + depth * turn[:, 2]
     return {"position": (axes @ position).tolist(), "target": (axes @ target).tolist(), "fov": float(fov)}
 
 
-def _bookmark(name: str, text: str, camera: dict[str, Any], degrees: float, aspect: float) -> dict[str, Any]:
+def _make_bookmark(name: str, text: str, camera: dict[str, Any], degrees: float, aspect: float) -> dict[str, Any]:
     """An annotation at the camera's own place. The viewer's cameras are level, so our page adds the lean.
 
     aspect: of the photo, which the page lets fill a window's width.
@@ -275,13 +280,13 @@ def _bookmark(name: str, text: str, camera: dict[str, Any], degrees: float, aspe
     }
 
 
-def _track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
+def _make_track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
     count = max(2, min(_MOST_KEYS, round(path.seconds * _KEYS_A_SECOND) + 1))
     rate = (count - 1) / path.seconds
     frames = range(count - path.closed)  # the end of a closed path is its beginning
     keys = [path.at(min(frame / rate, path.seconds)) for frame in frames]
     turns = Rotation.from_quat([key.wxyz for key in keys], scalar_first=True).as_matrix()
-    looks = [_look(axes, np.array(k.position), turn, depth, k.fov) for k, turn in zip(keys, turns, strict=True)]
+    looks = [_make_camera(axes, np.array(k.position), turn, depth, k.fov) for k, turn in zip(keys, turns, strict=True)]
     return {
         "name": "camera path",
         "duration": path.seconds,

@@ -10,8 +10,8 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from applications.export.grouping import groups_of
-from applications.export.merging import covariances, merged
+from applications.export.grouping import group_splats
+from applications.export.merging import covariances, merge_groups
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.host.listing import markdown_table
 from groundwork.host.progress import Bar
@@ -46,7 +46,7 @@ class Tile:
     high: np.ndarray
 
     def all(self) -> Iterator[Tile]:
-        """This tile and those below."""
+        """Return this tile and all tiles below it."""
         yield self
         for child in self.children:
             yield from child.all()
@@ -62,7 +62,7 @@ class Tile:
         return 1 + max((child.levels for child in self.children), default=0)
 
 
-def octree(splats: Splats, most: int = MOST, name: str = "r") -> Tile:
+def build_octree(splats: Splats, most: int = MOST, name: str = "r") -> Tile:
     """The tiles of a model. most: Gaussians of a leaf.
 
     A cell is split at the middle of the box of its means, so that a far Gaussian does not leave the others in one cell.
@@ -71,17 +71,17 @@ def octree(splats: Splats, most: int = MOST, name: str = "r") -> Tile:
     if len(splats) <= most or not (high > low).any() or len(name) > _DEEPEST:
         return Tile(name, splats, (), 0.0, *_box(splats))
     octants = (splats.means > (low + high) / 2) @ np.array([1, 2, 4])
-    children = tuple(octree(selected(splats, octants == k), most, f"{name}{k}") for k in np.unique(octants))
-    below = joined([child.splats for child in children])
-    order, starts = groups_of(below, GROUP)
-    own, spread = merged(selected(below, order), starts)
+    children = tuple(build_octree(selected(splats, octants == k), most, f"{name}{k}") for k in np.unique(octants))
+    below = join_splats([child.splats for child in children])
+    order, starts = group_splats(below, GROUP)
+    own, spread = merge_groups(selected(below, order), starts)
     error = max(child.error for child in children) + float(np.sqrt(np.mean(spread**2)))
     corners = [_box(own), *((child.low, child.high) for child in children)]
     lows, highs = zip(*corners, strict=True)
     return Tile(name, own, children, error, np.min(lows, axis=0), np.max(highs, axis=0))
 
 
-def joined(several: Sequence[Splats]) -> Splats:
+def join_splats(several: Sequence[Splats]) -> Splats:
     """Splats of several tiles, one after another."""
     names = ("means", "log_scales", "rotations", "opacity_logits", "sh")
     return replace(several[0], **{name: np.concatenate([getattr(some, name) for some in several]) for name in names})
@@ -99,16 +99,16 @@ def _box(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Views(Protocol):
-    """What levels are compared on: as `applications.export.formats.Around`."""
+    """Views on which levels are compared, such as `applications.export.formats.SceneInputs`."""
 
     cameras: Sequence[Camera]
     background: Sequence[float]
     pipe: argparse.Namespace
 
 
-def table(root: Tile, sizes: Sequence[int], around: Views) -> str:
-    """What each level has and loses, coarsest first, as Markdown. sizes: of the levels, bytes."""
-    found = losses(root, around.cameras, around.background, around.pipe)
+def make_table(root: Tile, sizes: Sequence[int], around: Views) -> str:
+    """Make a Markdown table of the levels, coarsest first: contents, and loss in PSNR. sizes: of the levels, bytes."""
+    found = measure_losses(root, around.cameras, around.background, around.pipe)
     best, rows = found[-1]["photos"], []
     for depth, (loss, size) in enumerate(zip(found, sizes, strict=True)):
         tiles = root.level(depth)
@@ -124,15 +124,15 @@ def table(root: Tile, sizes: Sequence[int], around: Views) -> str:
 
 
 @torch.no_grad()
-def losses(
+def measure_losses(
     root: Tile, cameras: Sequence[Camera], background: Sequence[float], pipe: argparse.Namespace
 ) -> list[Mapping[str, float | None]]:
-    """Of each level, coarsest first: `psnr` against the full model's images, and `photos` against the photos, dB.
+    """Measure each level, coarsest first: `psnr` against the full model's images, `photos` against the photos (dB).
 
-    They are means over the cameras. `psnr` is None where the images are equal, as those of the last level, and `photos`
-    where a camera has no photo.
+    Both are means over the cameras. `psnr` is None where the images are equal, as those of the last level; `photos` is
+    None where a camera has no photo.
     """
-    models = [model_of(joined([tile.splats for tile in root.level(depth)])) for depth in range(root.levels)]
+    models = [model_of(join_splats([tile.splats for tile in root.level(depth)])) for depth in range(root.levels)]
     pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": root.splats.antialiasing}))
     views = ScoredViews(pipe, torch.tensor(background, device=compute_device()), halves=False)
     have_photos = all(camera.image_path and camera.image_path.is_file() for camera in cameras)

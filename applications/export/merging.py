@@ -20,7 +20,7 @@ _MOST = 0.999  # opacity of a merged Gaussian
 _THIN = 1e-7  # least ratio of a merged Gaussian's scales, above the rounding of its covariance
 
 
-def areas(scales: np.ndarray) -> np.ndarray:
+def shadow_areas(scales: np.ndarray) -> np.ndarray:
     """Mean areas (N,) of the shadows of ellipsoids with half axes (N, 3), over all directions; float64."""
     a, b, c = scales.astype(np.float64).T
     powers = (a * b) ** _POWER + (a * c) ** _POWER + (b * c) ** _POWER
@@ -29,7 +29,7 @@ def areas(scales: np.ndarray) -> np.ndarray:
 
 def footprints(splats: Splats) -> np.ndarray:
     """Opacities times mean areas (N,) float64, in squared units of the means."""
-    return opacities(splats) * areas(np.exp(splats.log_scales.astype(np.float64)))
+    return opacities(splats) * shadow_areas(np.exp(splats.log_scales.astype(np.float64)))
 
 
 def covariances(splats: Splats) -> np.ndarray:
@@ -41,7 +41,7 @@ def covariances(splats: Splats) -> np.ndarray:
     return axes @ axes.transpose(0, 2, 1)
 
 
-def merged(splats: Splats, starts: np.ndarray) -> tuple[Splats, np.ndarray]:
+def merge_groups(splats: Splats, starts: np.ndarray) -> tuple[Splats, np.ndarray]:
     """One Gaussian for each group, and the spread (G,) of its means: their weighted RMS distance from the merged mean.
 
     starts: (G,) indices, ascending from 0; a group ends where the next one starts. A group of footprint 0 counts each
@@ -60,8 +60,8 @@ def merged(splats: Splats, starts: np.ndarray) -> tuple[Splats, np.ndarray]:
     middle = mean(places)
     apart = places - np.repeat(middle, sizes, axis=0)
     between = mean(apart[:, :, None] * apart[:, None])
-    scales, rotations = _axes(mean(covariances(splats)) + between)
-    opacity = np.minimum(totals / areas(scales), _MOST)
+    scales, rotations = _find_axes(mean(covariances(splats)) + between)
+    opacity = np.minimum(totals / shadow_areas(scales), _MOST)
     with np.errstate(divide="ignore"):  # the logit of 0 is infinite
         logits = np.log(opacity) - np.log1p(-opacity)
     values = {
@@ -75,7 +75,7 @@ def merged(splats: Splats, starts: np.ndarray) -> tuple[Splats, np.ndarray]:
     return replace(splats, **{name: value.astype(np.float32) for name, value in values.items()}), spread
 
 
-def _axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_axes(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Scales (N, 3) and quaternions (N, 4), wxyz, of covariances (N, 3, 3)."""
     squares, axes = np.linalg.eigh(covariance)
     axes[np.linalg.det(axes) < 0, :, 0] *= -1  # a rotation, not a reflection

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from applications.export.mesh_cleaning import area_vectors, smooth_rims, whole_parts
-from applications.export.mesh_colors import point_colors
+from applications.export.mesh_cleaning import area_vectors, keep_whole_parts, smooth_rims
+from applications.export.mesh_colors import color_points
 from applications.export.surfaces import Surfaces
-from applications.export.texture import textured
+from applications.export.texture import make_texture
 from applications.export.tsdf import BYTES, SIDE, TooManyBlocks, Volume
 from scene.cameras import Camera
 from scene.splats.splats import Splats
@@ -45,37 +45,37 @@ class Mesh:
     texture: np.ndarray | None = None
 
 
-def measure(
+def measure_surfaces(
     splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace, voxel: float | None = None
 ) -> tuple[Surfaces, Volume]:
-    """Surfaces of splats and the distances from them. UserError as for `Surfaces` and `volume_of`."""
+    """Surfaces of splats and the distances from them. UserError as for `Surfaces` and `fuse_volume`."""
     surfaces = Surfaces(splats, cameras, pipe)
-    return surfaces, volume_of(surfaces, voxel)
+    return surfaces, fuse_volume(surfaces, voxel)
 
 
-def mesh_of(
+def make_mesh(
     surfaces: Surfaces, volume: Volume, triangles: int | None = None, with_texture: bool = False
 ) -> tuple[Mesh, str]:
     """Make the clean mesh of surfaces, and a part of a sentence about it. UserError where nothing is left.
 
     triangles: at most. None: TRIANGLES of a mesh with a texture, and all of one with colours.
     """
-    vertices, every = whole_parts(*zero_level(volume, min(CONFIRMED, len(surfaces.views))))
-    vertices, faces = fewer(
+    vertices, every = keep_whole_parts(*extract_zero_level(volume, min(CONFIRMED, len(surfaces.views))))
+    vertices, faces = reduce_triangles(
         smooth_rims(vertices, every), every, triangles or (TRIANGLES if with_texture else len(every))
     )
     normals = vertex_normals(vertices, faces)
     if with_texture:
-        mesh = Mesh(*textured(vertices, faces, normals, surfaces, volume.voxel))
+        mesh = Mesh(*make_texture(vertices, faces, normals, surfaces, volume.voxel))
         look = f"a texture of {mesh.texture.shape[1]} x {mesh.texture.shape[0]} pixels, "
     else:
-        colors = point_colors(vertices, normals, surfaces, volume.voxel)
+        colors = color_points(vertices, normals, surfaces, volume.voxel)
         mesh, look = Mesh(vertices, faces, normals, colors), ""
     counts = f"{len(vertices):,} vertices, {len(faces):,} of {len(every):,} triangles"
     return mesh, f"{counts}, {look}{len(volume.keys) * SIDE**3 * BYTES / 1e9:.2f} GB of voxels of {volume.voxel:.3g}"
 
 
-def volume_of(surfaces: Surfaces, voxel: float | None = None) -> Volume:
+def fuse_volume(surfaces: Surfaces, voxel: float | None = None) -> Volume:
     """Distances from surfaces.
 
     voxel: its size in the world's unit. None: two pixels at the median depth, or larger where the voxels would be more
@@ -113,7 +113,7 @@ def _empty_volume(surfaces: Surfaces, voxel: float, coarser: bool) -> Volume:
         return volume
 
 
-def zero_level(volume: Volume, confirmed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def extract_zero_level(volume: Volume, confirmed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices and faces, as of `Mesh`, of the surfaces that `confirmed` views see. UserError if there are none.
 
     Also the weights (V,) of the vertices, as of the volume.
@@ -133,7 +133,7 @@ def zero_level(volume: Volume, confirmed: int) -> tuple[np.ndarray, np.ndarray, 
             places, triangles, _, _ = marching_cubes(values, 0.0, mask=cubes)
         except RuntimeError:  # no surface
             continue
-        keys.append(_edges(places, origin))
+        keys.append(_find_edges(places, origin))
         faces.append(triangles.astype(np.int64) + count)
         weights.append(sums[tuple(places.astype(int).T)])
         parts.append((places + origin.astype(np.float64)) * volume.voxel)
@@ -146,7 +146,7 @@ def zero_level(volume: Volume, confirmed: int) -> tuple[np.ndarray, np.ndarray, 
     return vertices, same.reshape(-1)[np.concatenate(faces)].astype(np.int32), np.concatenate(weights)[first]
 
 
-def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def _find_edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """(V, 4) int64: the edge of the grid on which each point lies, and its axis; of one within a cube, axis 3."""
     nearest = np.round(places)
     off = np.abs(places - nearest)
@@ -156,8 +156,8 @@ def _edges(places: np.ndarray, origin: np.ndarray) -> np.ndarray:
     return np.column_stack([lower + origin, axis])
 
 
-def fewer(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
-    """The same surface of `triangles`, or some fewer; of all if they are no more.
+def reduce_triangles(vertices: np.ndarray, faces: np.ndarray, triangles: int) -> tuple[np.ndarray, np.ndarray]:
+    """Reduce a surface to `triangles`, or some fewer; a surface of no more stays as it is.
 
     UserError if none would be left, or if the rims of the surface need more.
     """

@@ -15,26 +15,26 @@ def area_vectors(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def whole_parts(vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def keep_whole_parts(vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and faces of the broad and large parts of a mesh. weights (V,): how well views see the vertices.
 
     UserError where nothing is broad.
     """
-    left = broad(faces, len(vertices))
+    left = trim_narrow_parts(faces, len(vertices))
     if not len(left):
         raise UserError("all surfaces are too narrow for a mesh; give a smaller --voxel, or a larger --crop")
-    return large_parts(vertices, left, weights)
+    return keep_large_parts(vertices, left, weights)
 
 
-def broad(faces: np.ndarray, count: int) -> np.ndarray:
-    """The faces without what is narrow: the rim goes back by _WIDTH triangles, and forth where something is left.
+def trim_narrow_parts(faces: np.ndarray, count: int) -> np.ndarray:
+    """Remove narrow parts of a mesh: shrink its rim by _WIDTH triangles, and grow what is left again.
 
     count: of vertices.
     """
     left = faces
     for _ in range(_WIDTH):
         at_rim = np.zeros(count, bool)
-        at_rim[rim_edges(left, count)] = True
+        at_rim[find_rim_edges(left, count)] = True
         left = left[~at_rim[left].any(axis=1)]
     for _ in range(_WIDTH):
         near = np.zeros(count, bool)
@@ -43,15 +43,15 @@ def broad(faces: np.ndarray, count: int) -> np.ndarray:
     return left
 
 
-def rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
+def find_rim_edges(faces: np.ndarray, count: int) -> np.ndarray:
     """(E, 2) int64: edges with a face on one side only."""
     ends = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64), axis=1)
     keys, times = np.unique(ends @ [count, 1], return_counts=True)
     return np.stack(np.divmod(keys[times == 1], count), axis=1)
 
 
-def large_parts(vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The connected parts of which each has, in all views, at least a share _SMALL of the pixels of the largest one.
+def keep_large_parts(vertices: np.ndarray, faces: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keep the connected parts with at least a share _SMALL of the pixels that the largest part has in all views.
 
     The largest one alone would often lack the subject: photos hardly show where it stands on the floor. And what is far
     off in few views, mostly of a wrong shape, can have more triangles than the subject.
@@ -73,7 +73,7 @@ def smooth_rims(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
     Those of faces that this would turn over stay.
     """
-    edges, before, vertices = rim_edges(faces, len(vertices)), vertices, vertices.copy()
+    edges, before, vertices = find_rim_edges(faces, len(vertices)), vertices, vertices.copy()
     used, ends = np.unique(edges, return_inverse=True)
     one, other = ends.reshape(-1, 2).T
     both, across = np.concatenate([one, other]), np.concatenate([other, one])

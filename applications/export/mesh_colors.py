@@ -19,7 +19,7 @@ _FLAT = 0.05  # least cosine of the angle between a normal and the view, as norm
 
 
 @torch.no_grad()
-def colors_of(
+def average_colors(
     points: np.ndarray, normals: np.ndarray, surfaces: Surfaces, voxel: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Colours (P, 3) uint8 of points (P, 3), and which views see (P,) bool.
@@ -29,32 +29,32 @@ def colors_of(
     sums = torch.zeros(len(points), 4, device=surfaces.device)
     places, sides = (torch.from_numpy(values).to(surfaces.device) for values in (points, normals))
     for view, surface in surfaces.each("Colouring"):
-        layers = torch.cat([surface.color, _without_edges(surface, _NEAR * voxel)[None]])[None]
+        layers = torch.cat([surface.color, _remove_edges(surface, _NEAR * voxel)[None]])[None]
         for rows in torch.arange(len(points), device=surfaces.device).split(_AT_ONCE):
-            sums[rows] += _seen(view, layers, places[rows], sides[rows], voxel)
+            sums[rows] += _weigh_colors(view, layers, places[rows], sides[rows], voxel)
     seen = sums[:, 3] > 0
     colors = sums[:, :3] / torch.where(seen, sums[:, 3], 1)[:, None]
     return (255 * colors.clamp(0, 1)).round().byte().cpu().numpy(), seen.cpu().numpy()
 
 
-def point_colors(points: np.ndarray, normals: np.ndarray, surfaces: Surfaces, voxel: float) -> np.ndarray:
+def color_points(points: np.ndarray, normals: np.ndarray, surfaces: Surfaces, voxel: float) -> np.ndarray:
     """Colours (P, 3) uint8; points that no view sees have the colour of the nearest that one sees."""
     from scipy.spatial import KDTree
 
-    colors, seen = colors_of(points, normals, surfaces, voxel)
+    colors, seen = average_colors(points, normals, surfaces, voxel)
     if seen.any() and not seen.all():
         colors[~seen] = colors[seen][KDTree(points[seen]).query(points[~seen])[1]]
     return colors
 
 
-def _without_edges(surface: Surface, step: float) -> Tensor:
+def _remove_edges(surface: Surface, step: float) -> Tensor:
     """Depths (H, W), 0 also where a pixel beside is nearer or farther by more than `step`: its colour is mixed."""
     depth = surface.depth
     farthest, nearest = (sign * max_pool2d(sign * depth[None], 3, 1, 1)[0] for sign in (1, -1))
     return torch.where(farthest - nearest < step, depth, 0)
 
 
-def _seen(view: Camera | MiniCam, layers: Tensor, points: Tensor, normals: Tensor, voxel: float) -> Tensor:
+def _weigh_colors(view: Camera | MiniCam, layers: Tensor, points: Tensor, normals: Tensor, voxel: float) -> Tensor:
     """(P, 4): colours of points times weights, and weights. layers (1, 4, H, W): colours and depths of the view."""
     clip = points @ view.full_proj_transform[:3] + view.full_proj_transform[3]
     depths = clip[:, 3]

@@ -46,7 +46,7 @@ def find_packages(path: str | os.PathLike) -> None:
             raise UserError(f"{path} needs the package {package}; run pip install '.[export]'") from error
 
 
-def with_z_up(mesh: Mesh) -> Mesh:
+def turn_z_up(mesh: Mesh) -> Mesh:
     """A mesh with z up instead of -y. Where x was east and z north, x is east, y north and z up."""
     (x, y, z), (to_x, to_y, to_z) = mesh.vertices.T, mesh.normals.T
     return replace(mesh, vertices=np.stack([x, z, -y], axis=1), normals=np.stack([to_x, to_z, -to_y], axis=1))
@@ -126,11 +126,13 @@ def check_obj_mesh(path: str | os.PathLike) -> None:
         )
     refuse_foreign(Path(path).with_suffix(".png"))
     material = Path(path).with_suffix(".mtl")
-    if os.path.lexists(material) and not (material.is_file() and material.read_text("utf-8", "replace") == _mtl(path)):
+    if os.path.lexists(material) and not (
+        material.is_file() and material.read_text("utf-8", "replace") == _material_path(path)
+    ):
         raise UserError(f"no export wrote {material}, and this one would replace it; move it, or choose another --to")
 
 
-def _mtl(path: str | os.PathLike) -> str:
+def _material_path(path: str | os.PathLike) -> str:
     return f"newmtl mesh\nKd 1 1 1\nillum 0\nmap_Kd {Path(path).stem}.png\n"
 
 
@@ -138,7 +140,7 @@ def write_obj_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
     """Write an OBJ, and beside it its material and its texture, each whole or not at all."""
     write_picture(Path(path).with_suffix(".png"), Image.fromarray(mesh.texture))
     with atomic_write(Path(path).with_suffix(".mtl")) as temporary:
-        temporary.write_text(_mtl(path), encoding="utf-8")
+        temporary.write_text(_material_path(path), encoding="utf-8")
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(f"mtllib {Path(path).stem}.mtl\nusemtl mesh\n")
         turn = np.float32([1, -1, -1])

@@ -1,4 +1,4 @@
-"""What a page tells its guests (--notes): a text file with a title, facts, and notes on views of training photos.
+"""Notes of a page for its guests (--notes): a text file with a title, facts, and texts on views of training photos.
 
     # My room
     Author: A. Name
@@ -63,7 +63,7 @@ def read_notes(path: str) -> Notes:
         if marks == "#":
             if place or text or not name:
                 raise UserError(f"--notes {path}: “# {name}” is not the first line; begin views with ##")
-            title, facts, text = name, *_facts_of(lines)
+            title, facts, text = name, *_split_facts(lines)
             continue
         camera = _FACT.fullmatch(lines[0].strip()) if lines else None
         if not name or camera is None or camera[1].lower() != "camera":
@@ -83,7 +83,7 @@ def read_notes(path: str) -> Notes:
     return Notes(title, facts, text, tuple(views))
 
 
-def _facts_of(lines: list[str]) -> tuple[tuple[tuple[str, str], ...], str]:
+def _split_facts(lines: list[str]) -> tuple[tuple[tuple[str, str], ...], str]:
     """The lines `name: value` at the beginning, and the text after them."""
     found = []
     while lines and (fact := _FACT.fullmatch(lines[0].strip())):

@@ -10,8 +10,8 @@ from PIL import Image
 
 from applications.export.notes import Note
 from gaussian_renderer import render
-from gaussian_renderer.camera_paths.poses import opening, poses_of
-from gaussian_renderer.camera_paths.start import narrowed
+from gaussian_renderer.camera_paths.poses import poses_of, vertical_fov
+from gaussian_renderer.camera_paths.start import narrow_fov
 from gaussian_renderer.free_view import free_view
 from groundwork.files.image_files import to_bytes
 from groundwork.files.ours import write_picture
@@ -25,8 +25,8 @@ PICTURE = 1200, 630  # px, as services ask for
 _QUALITY = 88  # of its JPEG
 
 
-def named(name: str, names: Sequence[str], said: str) -> int:
-    """The camera of a photo, whose name may lack its ending. UserError if there is none, with `said`."""
+def find_named(name: str, names: Sequence[str], said: str) -> int:
+    """Return the index of the photo `name`, with or without ending. UserError, which begins with `said`, if none."""
     for found in (list(names), [os.path.splitext(one)[0] for one in names]):
         if name in found:
             return found.index(name)
@@ -36,7 +36,7 @@ def named(name: str, names: Sequence[str], said: str) -> int:
 def check_note(note: Note, cameras: Sequence[Camera]) -> None:
     """UserError for a note that names no training photo, or a place outside of it."""
     names = [str(camera.image_name) for camera in cameras]
-    width, height = cameras[named(note.camera, names, f"--notes: {note.camera}")].photo_size
+    width, height = cameras[find_named(note.camera, names, f"--notes: {note.camera}")].photo_size
     x, y = note.at or (0, 0)
     if x > width or y > height:
         fault = f"is at {x:g} {y:g}, outside of {note.camera} with {width} x {height} pixels"
@@ -53,7 +53,7 @@ def write_preview(
 ) -> None:
     """Write a JPEG of the first picture, in a window of PICTURE."""
     (width, height), poses = PICTURE, poses_of([camera])
-    fov = narrowed(opening(camera), camera.image_width / camera.image_height, width / height)
+    fov = narrow_fov(vertical_fov(camera), camera.image_width / camera.image_height, width / height)
     model = model_of(splats)
     place = poses.positions[0].tolist(), poses.quaternions[0].tolist()
     view = free_view(width, height, fov, *place, model.get_xyz.device)

@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from applications.export.sog import fault_of, find_splat_transform
+from applications.export.sog import find_fault, find_splat_transform
 from scene.splats.reading import READABLE
 from scene.splats.splats import Splats
 from scene.with_splats import splats_in
@@ -19,6 +19,6 @@ def read_any(path: str | os.PathLike) -> Splats:
     program = find_splat_transform(path)
     with temporary_folder() as folder:
         model = folder / "model.ply"
-        if fault := fault_of([program, os.path.abspath(path), str(model)], model):
+        if fault := find_fault([program, os.path.abspath(path), str(model)], model):
             raise UserError(f"{path} is not read by {program} ({fault}); save or download it again")
         return splats_in(model)

@@ -41,8 +41,8 @@ def write_glb(path: str | os.PathLike, splats: Splats) -> None:
 
     Without splats it has a node without a mesh, as glTF has no empty one.
     """
-    attributes = _attributes(splats) if len(splats) else {}
-    document = _document(attributes, [values.nbytes for values in attributes.values()], splats.antialiasing)
+    attributes = _list_attributes(splats) if len(splats) else {}
+    document = _make_document(attributes, [values.nbytes for values in attributes.values()], splats.antialiasing)
     georeference(document, splats.place)
     write_binary_gltf(
         path, document, attributes.values(), "leave Gaussians out by --max_splats, or bands by --sh_degree"
@@ -53,8 +53,8 @@ def write_compressed_glb(path: str | os.PathLike, splats: Splats) -> None:
     """Write a compressed GLB of one splat or more, whole or not at all. UserError for what it cannot hold."""
     packed = packed_spz(splats, 2)
     elsewhere = f"{EXTENSION}:OPACITY", f"{EXTENSION}:SH_DEGREE_0_COEF_0"
-    attributes = {name: x for name, x in _attributes(half_rotated(splats)).items() if name not in elsewhere}
-    document = _document(attributes, [len(packed)], splats.antialiasing)
+    attributes = {name: x for name, x in _list_attributes(half_rotated(splats)).items() if name not in elsewhere}
+    document = _make_document(attributes, [len(packed)], splats.antialiasing)
     document["extensionsUsed"] = document["extensionsRequired"] = [EXTENSION, COMPRESSION]
     (primitive,) = document["meshes"][0]["primitives"]
     primitive["extensions"][EXTENSION]["extensions"] = {COMPRESSION: {"bufferView": 0}}
@@ -104,7 +104,7 @@ def write_binary_gltf(
             file.write(np.ascontiguousarray(values))
 
 
-def _attributes(splats: Splats) -> dict[str, np.ndarray]:
+def _list_attributes(splats: Splats) -> dict[str, np.ndarray]:
     values = {
         "POSITION": splats.means,
         "COLOR_0": rgba_bytes(splats),
@@ -118,7 +118,7 @@ def _attributes(splats: Splats) -> dict[str, np.ndarray]:
     return {name: x if x.dtype == np.uint8 else x.astype("<f4") for name, x in values.items()}
 
 
-def _document(attributes: dict[str, np.ndarray], sizes: list[int], antialiasing: bool) -> dict:
+def _make_document(attributes: dict[str, np.ndarray], sizes: list[int], antialiasing: bool) -> dict:
     node = {"name": "splats", "rotation": [1, 0, 0, 0]}
     document = {
         "asset": {"version": "2.0", "generator": "export.py", "extras": {"antialiasing": antialiasing}},
@@ -140,7 +140,7 @@ def _document(attributes: dict[str, np.ndarray], sizes: list[int], antialiasing:
     }
     return document | {
         "meshes": [{"primitives": [primitive]}],
-        "accessors": [_accessor(index, name, values) for index, (name, values) in enumerate(attributes.items())],
+        "accessors": [_make_accessor(index, name, values) for index, (name, values) in enumerate(attributes.items())],
         "bufferViews": [
             {"buffer": 0, "byteOffset": int(start), "byteLength": size, "target": _ARRAY_BUFFER}
             for start, size in zip(starts, sizes, strict=False)
@@ -149,7 +149,7 @@ def _document(attributes: dict[str, np.ndarray], sizes: list[int], antialiasing:
     }
 
 
-def _accessor(index: int, name: str, values: np.ndarray) -> dict:
+def _make_accessor(index: int, name: str, values: np.ndarray) -> dict:
     is_byte = values.dtype == np.uint8
     accessor = {
         "bufferView": index,
@@ -187,7 +187,7 @@ def write_usd_package(path: str | os.PathLike, fill: Callable[[ModuleType, Any, 
             done = usd.UsdUtils.CreateNewUsdzPackage(usd.Sdf.AssetPath(str(layer)), str(temporary))
         except usd.Tf.ErrorException:
             done = False
-        if not done or not _is_whole(temporary):
+        if not done or not _is_complete(temporary):
             raise UserError(
                 f"cannot write {path}; free space there and in {folder.parent}, fix the permissions, or choose "
                 "another place"
@@ -208,8 +208,8 @@ def _forget_time(package: Path) -> None:
             place += 46 + sum(struct.unpack("<3H", file.read(6)))
 
 
-def _is_whole(package: Path) -> bool:
-    """Whether a package has all of its bytes: OpenUSD does not tell of a disk that was full."""
+def _is_complete(package: Path) -> bool:
+    """Tell if a package has all of its bytes: OpenUSD raises no error when the disk is full."""
     try:
         with zipfile.ZipFile(package) as archive:
             return archive.testzip() is None

@@ -37,7 +37,7 @@ def write_sog(path: str | os.PathLike, splats: Splats) -> None:
     program = find_splat_transform(path)
     if not len(splats):
         raise UserError(f"{path} would have no splats, which {PROGRAM} does not write; choose another format")
-    tell_if_slow(len(splats), splats.sh_degree)
+    warn_if_slow(len(splats), splats.sh_degree)
     with temporary_folder() as folder, atomic_write(path) as temporary:
         model, packed = folder / "model.ply", folder / "model.sog"
         write_plain_ply(model, splats)
@@ -45,7 +45,7 @@ def write_sog(path: str | os.PathLike, splats: Splats) -> None:
         _copy_without_dates(packed, temporary)
 
 
-def tell_if_slow(count: int, sh_degree: int) -> None:
+def warn_if_slow(count: int, sh_degree: int) -> None:
     """Say before the wait why splat-transform takes minutes, and what takes none."""
     minutes = round(_MINUTES * count * min(count, _CLUSTERS))
     if sh_degree and minutes:
@@ -65,31 +65,31 @@ def run_program(program: str, inputs: Sequence[str], output: Path, path: str | o
     options = [os.environ.get("NODE_OPTIONS", ""), f"--import=data:text/javascript,{quote(_SEEDED)}"]
     environment = {**os.environ, "NODE_OPTIONS": " ".join(options).strip()}
     command = [program, "--overwrite", "--gpu", "cpu", *inputs, os.path.abspath(output)]
-    if fault := fault_of(command, output, environment):
+    if fault := find_fault(command, output, environment):
         raise UserError(f"{PROGRAM} could not write {path} ({fault}); choose another format, or update it")
 
 
-def fault_of(command: Sequence[str], output: Path, environment: Mapping[str, str] | None = None) -> str:
+def find_fault(command: Sequence[str], output: Path, environment: Mapping[str, str] | None = None) -> str:
     """Run splat-transform, show the last line that it has said, and return why it wrote no `output`; "" if it did."""
     bar = Bar(desc=PROGRAM, bar_format="{desc}: {elapsed}{postfix}", leave=False)
     with temporary_folder() as folder, open(folder / "log", "wb") as log, bar:
         with subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, env=environment) as process:
             try:
                 while process.poll() is None:
-                    bar.set_postfix_str(_lines(folder / "log")[-1])
+                    bar.set_postfix_str(_read_lines(folder / "log")[-1])
                     with contextlib.suppress(subprocess.TimeoutExpired):
                         process.wait(_LOOK)
             except BaseException:
                 process.kill()
                 raise
-        said = _lines(folder / "log")
+        said = _read_lines(folder / "log")
     if not process.returncode and output.is_file():
         return ""
     return next((line for line in said if "error" in line.lower()), said[-1])
 
 
-def _lines(log: Path) -> list[str]:
-    """What the program has said: lines without bullets and paths of its code."""
+def _read_lines(log: Path) -> list[str]:
+    """Return the lines that the program printed, without bullets and paths of its code."""
     text = log.read_text(encoding="utf-8", errors="replace").replace("\r", "\n")
     return [line.strip(" ▸·✗") for line in text.splitlines() if line.strip()] or ["it said nothing"]
 

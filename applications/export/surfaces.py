@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gaussian_renderer.camera_paths.poses import keyframe, opening, poses_of
+from gaussian_renderer.camera_paths.poses import keyframe, poses_of, vertical_fov
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.median_depth import Surface, surface_of
 from groundwork.host.progress import Bar
@@ -27,11 +27,11 @@ class Surfaces:
         """UserError if there is no camera, or none sees a surface."""
         self._gaussians = model_of(splats)
         self._pipe = argparse.Namespace(**(vars(pipe) | {"antialiasing": splats.antialiasing}))
-        self.views = pinholes(cameras)
+        self.views = make_pinholes(cameras)
         if not self.views:
             raise UserError("a mesh needs training cameras, from which it sees the surfaces; the scene has none")
         tried = self.views[:: -(-len(self.views) // _TRIED)]
-        spans = [_spans(view, self._surface(view).depth) for view in tried]
+        spans = [_measure_pixel(view, self._surface(view).depth) for view in tried]
         if not any(spans):
             raise UserError("a mesh needs surfaces, and no training view shows anything opaque; train for longer")
         depth, self.pixel = np.median([span for span in spans if span], axis=0).tolist()
@@ -51,19 +51,19 @@ class Surfaces:
         return surface_of(view, self._gaussians, self._pipe)
 
 
-def pinholes(cameras: Sequence[Camera]) -> list[Camera | MiniCam]:
-    """The views, and in the places of those with lenses views without, as wide as these are high, or 60 degrees."""
+def make_pinholes(cameras: Sequence[Camera]) -> list[Camera | MiniCam]:
+    """Replace views with lenses by pinhole views at their places, as wide as those are high, or 60 degrees."""
     views = []
     for camera, poses in ((camera, poses_of([camera])) for camera in cameras):
         if getattr(camera, "lens", None) is not None:
             pose = keyframe(0.0, poses.positions[0], poses.turns[0], 0.0)
             size = camera.image_width, camera.image_height
-            camera = free_view(*size, opening(camera), pose.position, pose.wxyz, camera.device)
+            camera = free_view(*size, vertical_fov(camera), pose.position, pose.wxyz, camera.device)
         views.append(camera)
     return views
 
 
-def _spans(view: Camera | MiniCam, depth: Tensor) -> tuple[float, float] | None:
+def _measure_pixel(view: Camera | MiniCam, depth: Tensor) -> tuple[float, float] | None:
     """The median depth of a view, and the height of a pixel there; None of an empty one."""
     known = depth[depth > 0]
     if not len(known):

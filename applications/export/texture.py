@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 from applications.export.mesh_cleaning import area_vectors
-from applications.export.mesh_colors import colors_of
+from applications.export.mesh_colors import average_colors
 from applications.export.surfaces import Surfaces
 
 _LARGEST = 4096  # pixels of the longer side that are asked for; gaps between charts take more
@@ -15,15 +15,15 @@ _GROUP = 1000  # triangles that are laid out at once: the time for more grows fa
 _AT_ONCE = 1 << 20  # pixels
 
 
-def textured(
+def make_texture(
     vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, surfaces: Surfaces, voxel: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, None, np.ndarray, np.ndarray]:
     """The values of a `Mesh` with a texture. Vertices where charts meet are there for each chart."""
     print(f"Laying out {len(faces):,} triangles in an image", file=sys.stderr)
     area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum() / 2
-    rows, faces, uv, size = _layout(vertices, faces, normals, int(min(_LARGEST, area**0.5 / surfaces.pixel)))
+    rows, faces, uv, size = _lay_out(vertices, faces, normals, int(min(_LARGEST, area**0.5 / surfaces.pixel)))
     vertices, normals = vertices[rows], normals[rows]
-    owners = owners_of(faces, uv * size, size)
+    owners = find_owners(faces, uv * size, size)
     covered = owners >= 0
     of, pixels = faces[owners[covered]], np.argwhere(covered)[:, ::-1] + 0.5
     points, sides = np.empty((2, len(of), 3), np.float32)
@@ -34,13 +34,13 @@ def textured(
             np.einsum("nk,nkc->nc", shares, values[of[part]]) for values in (vertices, normals)
         )
     image = np.zeros((*covered.shape, 3), np.uint8)
-    colors, seen = colors_of(points, sides, surfaces, voxel)
+    colors, seen = average_colors(points, sides, surfaces, voxel)
     image[covered] = colors
     covered[covered] = seen
-    return vertices, faces, normals, None, uv, _spread(image, covered)
+    return vertices, faces, normals, None, uv, _fill_gaps(image, covered)
 
 
-def _layout(
+def _lay_out(
     vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, resolution: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The old row of each new vertex, new faces, places (V, 2) float32 in [0, 1], and the image's size (2,) in pixels.
@@ -50,7 +50,7 @@ def _layout(
     import xatlas
 
     atlas, given = xatlas.Atlas(), []
-    for group in _groups(vertices[faces].mean(axis=1), np.arange(len(faces))):
+    for group in _group_faces(vertices[faces].mean(axis=1), np.arange(len(faces))):
         used, local = np.unique(faces[group], return_inverse=True)
         atlas.add_mesh(vertices[used], local.reshape(-1, 3).astype(np.uint32), normals[used])
         given.append(used)
@@ -68,16 +68,16 @@ def _layout(
     return np.concatenate(rows), np.concatenate(triangles), np.concatenate(uv), size
 
 
-def _groups(middles: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
+def _group_faces(middles: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
     """Rows of faces in boxes, halved until each has _GROUP at most. middles (F, 3)."""
     if len(rows) <= _GROUP:
         return [rows]
     half, axis = len(rows) // 2, np.ptp(middles[rows], axis=0).argmax()
     order = rows[np.argpartition(middles[rows, axis], half)]
-    return _groups(middles, order[:half]) + _groups(middles, order[half:])
+    return _group_faces(middles, order[:half]) + _group_faces(middles, order[half:])
 
 
-def owners_of(faces: np.ndarray, pixels: np.ndarray, size: np.ndarray) -> np.ndarray:
+def find_owners(faces: np.ndarray, pixels: np.ndarray, size: np.ndarray) -> np.ndarray:
     """(H, W) int32: the face that each pixel of the image is of, -1 for none. pixels (V, 2): vertices in the image."""
     image = Image.new("I", tuple(size.tolist()), -1)
     draw = ImageDraw.Draw(image)
@@ -98,7 +98,7 @@ def barycentric(pixels: np.ndarray, faces: np.ndarray, points: np.ndarray) -> np
     return places / places.sum(axis=1, keepdims=True)
 
 
-def _spread(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
+def _fill_gaps(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """The image with the nearest covered pixel's colour everywhere else."""
     from scipy.ndimage import distance_transform_edt
 

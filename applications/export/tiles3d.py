@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from applications.export.beside import PLACE, with_folder
-from applications.export.levels import Tile, Views, octree, table
+from applications.export.levels import Tile, Views, build_octree, make_table
 from applications.export.scene_formats import COMPRESSION, EXTENSION, write_compressed_glb, write_glb
+from applications.export.side_files import PLACE, write_with_folder
 from scene.splats.splats import Splats
 from scene.splats.spz import warn_of_sizes
 
@@ -30,49 +30,49 @@ def write_tileset(path: str | os.PathLike, splats: Splats, around: Views, compre
 
     The files of an earlier tileset of this name go once the new one is there. compressed: for CesiumJS.
     """
-    root, path, sizes = octree(splats), Path(path), {}
+    root, path, sizes = build_octree(splats), Path(path), {}
     write = write_compressed_glb if compressed else write_glb
     if compressed:
         warn_of_sizes([tile.splats for tile in root.all()])
-    with with_folder(path, "tiles-") as folder:
+    with write_with_folder(path, "tiles-") as folder:
         for tile in root.all():
             if len(tile.splats):
                 write(folder / f"{tile.name}.glb", replace(tile.splats, place=()))  # which the root has
                 sizes[tile.name] = (folder / f"{tile.name}.glb").stat().st_size
         (folder / path.name).write_text(
-            json.dumps(document(root, PLACE, compressed), allow_nan=False), encoding="utf-8"
+            json.dumps(make_document(root, PLACE, compressed), allow_nan=False), encoding="utf-8"
         )
     levels = [root.level(depth) for depth in range(root.levels)]
-    print(table(root, [sum(sizes.get(tile.name, 0) for tile in level) for level in levels], around))
+    print(make_table(root, [sum(sizes.get(tile.name, 0) for tile in level) for level in levels], around))
     return f"{root.levels} levels, {len(sizes)} tiles with {sum(sizes.values()) / 1e6:.2f} MB in a folder beside it"
 
 
-def document(root: Tile, folder: str, compressed: bool = False) -> dict[str, Any]:
+def make_document(root: Tile, folder: str, compressed: bool = False) -> dict[str, Any]:
     """The content of tileset.json."""
     announced = {"extensionsUsed": [EXTENSION]}
     if compressed:  # CesiumJS takes tiles for splats where both are required
         announced = dict.fromkeys(("extensionsUsed", "extensionsRequired"), [EXTENSION, COMPRESSION])
     width = float(np.linalg.norm(root.high - root.low))
-    transform = {"transform": on_globe(root.splats.place)} if root.splats.place else {}
+    transform = {"transform": place_on_globe(root.splats.place)} if root.splats.place else {}
     return {
         "asset": {"version": "1.1", "extras": {"generator": "export.py", "folder": folder}},
         "extensionsUsed": [_ANNOUNCED],
         "extensions": {_ANNOUNCED: announced},
         "geometricError": max(width, 2 * root.error),  # of a viewer that draws nothing
-        "root": {"refine": "REPLACE", **transform, **_entry(root, folder)},
+        "root": {"refine": "REPLACE", **transform, **_make_entry(root, folder)},
     }
 
 
-def _entry(tile: Tile, folder: str) -> dict[str, Any]:
-    entry = {"boundingVolume": {"box": box(tile.low, tile.high)}, "geometricError": tile.error}
+def _make_entry(tile: Tile, folder: str) -> dict[str, Any]:
+    entry = {"boundingVolume": {"box": make_box(tile.low, tile.high)}, "geometricError": tile.error}
     if len(tile.splats):
         entry["content"] = {"uri": f"{folder}/{tile.name}.glb"}
     if tile.children:
-        entry["children"] = [_entry(child, folder) for child in tile.children]
+        entry["children"] = [_make_entry(child, folder) for child in tile.children]
     return entry
 
 
-def box(low: np.ndarray, high: np.ndarray) -> list[float]:
+def make_box(low: np.ndarray, high: np.ndarray) -> list[float]:
     """A boundingVolume's middle and half axes, 12 numbers in the axes of tiles, of corners (3,) in those of COLMAP.
 
     The GLB's node takes x y z to x -y -z, and the viewer that to x z -y.
@@ -81,7 +81,7 @@ def box(low: np.ndarray, high: np.ndarray) -> list[float]:
     return [*middle.tolist(), *np.diag(half).ravel().tolist()]
 
 
-def on_globe(place: tuple[float, ...]) -> list[float]:
+def place_on_globe(place: tuple[float, ...]) -> list[float]:
     """The transform from metres east, north and up of a place, as of `Splats`, to EPSG:4978: 16 numbers by columns.
 
     Formulas of geodetic coordinates: EPSG guidance note 7-2, 4.1.1. The height counts from the ellipsoid here, and in

@@ -26,13 +26,13 @@ class TooManyBlocks(Exception):
     """The surfaces need more blocks than allowed."""
 
 
-def _keys(blocks: Tensor) -> Tensor:
+def _encode_keys(blocks: Tensor) -> Tensor:
     """(N,) int64 keys of block coordinates (N, 3) int64, in whose order x goes before y before z."""
     x, y, z = (blocks + _OFFSET).unbind(1)
     return (x << 2 * _BITS) | (y << _BITS) | z
 
 
-def _blocks(keys: Tensor) -> Tensor:
+def _decode_keys(keys: Tensor) -> Tensor:
     mask = (1 << _BITS) - 1
     return torch.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], 1) - _OFFSET
 
@@ -46,13 +46,13 @@ class Volume:
 
     def add_blocks(self, camera: Camera | MiniCam, depth: Tensor, most: int) -> None:
         """Add the blocks within the truncation around the depths (H, W), 0: unknown. TooManyBlocks above `most`."""
-        rays, known = _rays(camera, depth.shape), depth > 0
+        rays, known = _make_rays(camera, depth.shape), depth > 0
         rays, depths = rays[known], depth[known]
         for offset in (-TRUNCATION, 0.0, TRUNCATION):
             points = camera.camera_center + rays * (depths + offset * self.voxel)[:, None]
             near = (points / (SIDE * self.voxel)).floor().long()
             near = near[(near.abs() < _OFFSET).all(1)]
-            self.keys = torch.unique(torch.cat([self.keys, torch.unique(_keys(near))]))
+            self.keys = torch.unique(torch.cat([self.keys, torch.unique(_encode_keys(near))]))
         if len(self.keys) > most:
             raise TooManyBlocks
 
@@ -68,8 +68,8 @@ class Volume:
         members = _MEMBERS.to(self.keys.device)
         for rows in torch.arange(len(self.keys), device=self.keys.device).split(_AT_ONCE):
             rows = rows[self._in_view(camera, rows)]
-            places = _blocks(self.keys[rows])[:, None] * SIDE + members
-            at, axial = _pixels(camera, places.reshape(-1, 3).float() * self.voxel, depth.shape)
+            places = _decode_keys(self.keys[rows])[:, None] * SIDE + members
+            at, axial = _find_pixels(camera, places.reshape(-1, 3).float() * self.voxel, depth.shape)
             seen = depth.flatten()[at.clamp_min(0)]
             away = (seen - axial) / (TRUNCATION * self.voxel)
             counts = (at >= 0) & (seen > 0) & (away > -1)
@@ -80,7 +80,7 @@ class Volume:
 
     def _in_view(self, camera: Camera | MiniCam, rows: Tensor) -> Tensor:
         """(R,) bool: blocks that reach into a view's pyramid, with some margin."""
-        middles = (_blocks(self.keys[rows]).float() * SIDE + (SIDE - 1) / 2) * self.voxel
+        middles = (_decode_keys(self.keys[rows]).float() * SIDE + (SIDE - 1) / 2) * self.voxel
         clip = middles @ camera.full_proj_transform[:3] + camera.full_proj_transform[3]
         radius = SIDE * self.voxel
         steep = camera.full_proj_transform[:3].norm(dim=0)  # by how much a step of one unit changes each at most
@@ -93,7 +93,7 @@ class Volume:
 
         Known are voxels that at least `confirmed` views have counted.
         """
-        blocks = _blocks(self.keys)
+        blocks = _decode_keys(self.keys)
         for chunk in torch.unique(torch.div(blocks, side, rounding_mode="floor"), dim=0):
             first = chunk * side
             rows = ((blocks >= first) & (blocks <= first + side)).all(1).nonzero()[:, 0]
@@ -111,7 +111,7 @@ class Volume:
             yield ((first * SIDE).cpu().numpy(), *cut)
 
 
-def _rays(camera: Camera | MiniCam, size: tuple[int, int]) -> Tensor:
+def _make_rays(camera: Camera | MiniCam, size: tuple[int, int]) -> Tensor:
     """(H, W, 3): from the camera's centre to the points of depth 1 in the middles of the pixels."""
     height, width = size
     matrix = camera.full_proj_transform
@@ -122,8 +122,8 @@ def _rays(camera: Camera | MiniCam, size: tuple[int, int]) -> Tensor:
     return torch.stack([x, y, torch.ones_like(x)], 2) @ inverse
 
 
-def _pixels(camera: Camera | MiniCam, points: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Of points (N, 3): the indices (N,) of the pixels that show them, -1 outside of the view, and depths (N,)."""
+def _find_pixels(camera: Camera | MiniCam, points: Tensor, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Return the indices (N,) of the pixels that show points (N, 3), -1 outside of the view, and depths (N,)."""
     height, width = size
     clip = points @ camera.full_proj_transform[:3] + camera.full_proj_transform[3]
     depths = clip[:, 3]

@@ -39,47 +39,48 @@ def check_upright(args: argparse.Namespace) -> None:
             "--upright needs a model folder (-m) of a scene that was oriented; run convert.py --orient on it, or leave "
             "--upright out"
         )
-    if not Similarity.of(record, f"orientation of {args.model_path}").upright:
+    if not Similarity.read(record, f"orientation of {args.model_path}").upright:
         raise UserError("--upright: convert.py --orient found no vertical of this scene; leave --upright out")
 
 
-def oriented_later(args: argparse.Namespace) -> bool:
-    """Whether --upright follows the orientation of the scene, which a model of other poses does not fit."""
+def follows_scene(args: argparse.Namespace) -> bool:
+    """Tell if --upright takes the orientation from the scene; it does not fit a model of other poses."""
     return args.upright and ENTRY not in read_model_json(args.model_path)
 
 
-def placed(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any) -> tuple[Splats, Any]:
-    """The splats, and the `Around` of a page or mesh (`of_scene`), in the frame that the options ask for.
+def move_upright(args: argparse.Namespace, of_scene: bool, splats: Splats, around: Any) -> tuple[Splats, Any]:
+    """Move the splats, and the `SceneInputs` of a page or mesh, into the frame that the options ask for.
 
-    They have passed `check_upright`.
+    args: options that have passed `check_upright`.
+    of_scene: the format takes `SceneInputs`.
     """
     local = None
     if not args.no_upright and (args.upright or of_scene):
         local = local_similarity(args.model_path, args.source_path)
     if local is None:
         return splats, around
-    return moved_splats(splats, local), moved_around(around, local) if around else around
+    return move_splats(splats, local), move_inputs(around, local) if around else around
 
 
-def moved_splats(splats: Splats, similarity: Similarity) -> Splats:
-    """The same Gaussians under a similarity of their frame; they have no offset then.
+def move_splats(splats: Splats, similarity: Similarity) -> Splats:
+    """Move Gaussians by a similarity of their frame; the result has no offset.
 
     Directions turn with the world, so SH bands do; a larger scale needs no enlargement where they are drawn.
     """
     enlargement = 2.0 ** np.ceil(np.log2(splats.enlargement / similarity.scale))
     return replace(
         rotated(splats, similarity.rotation),
-        means=similarity.points(splats.means).astype(np.float32),
+        means=similarity.transform(splats.means).astype(np.float32),
         log_scales=splats.log_scales + np.float32(np.log(similarity.scale)),
         enlargement=max(1.0, float(enlargement)),
         place=similarity.place,
     )
 
 
-def moved_cameras(cameras: Sequence[Camera], similarity: Similarity) -> list[Camera]:
-    """Copies of cameras that see moved splats as the cameras see the splats."""
+def move_cameras(cameras: Sequence[Camera], similarity: Similarity) -> list[Camera]:
+    """Copy cameras, and move them so that they see the moved splats as before."""
     poses = poses_of(cameras)
-    places, turns = similarity.points(poses.positions), similarity.rotation @ poses.turns
+    places, turns = similarity.transform(poses.positions), similarity.rotation @ poses.turns
     twins = [copy.copy(camera) for camera in cameras]
     for twin, place, turn in zip(twins, places, turns, strict=True):
         twin.place(turn, -turn.T @ place)
@@ -106,19 +107,19 @@ class MovedPath:
         from scipy.spatial.transform import Rotation
 
         key = self.path.at(seconds)
-        place = self.similarity.points(np.array([key.position]))[0]
+        place = self.similarity.transform(np.array([key.position]))[0]
         turn = self.similarity.rotation @ Rotation.from_quat(key.wxyz, scalar_first=True).as_matrix()
         return keyframe(key.seconds, place, turn, key.fov)
 
 
-def moved_around(around: Any, similarity: Similarity) -> Any:
-    """What pages and meshes take besides splats (applications/export/formats.py), under a similarity.
+def move_inputs(around: Any, similarity: Similarity) -> Any:
+    """Return `SceneInputs` (applications/export/formats.py) with its cameras and paths moved by a similarity.
 
-    A path is made in the model's own frame, in which files of keyframes are.
+    A path is made in the model's own frame, in which files of keyframes are, and then moved.
     """
     cameras, make = around.cameras, around.make_path
     if not cameras:
         return around
     make_moved = make and (lambda _: MovedPath(make(poses_of(cameras)), similarity))
-    moved = {"cameras": moved_cameras(cameras, similarity), "make_path": make_moved}
+    moved = {"cameras": move_cameras(cameras, similarity), "make_path": make_moved}
     return around._replace(**moved, upright=similarity.upright, metric=similarity.metric)

@@ -34,13 +34,13 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not find_program("npm"):
         raise UserError("npm is not installed; install Node 20 or later, which brings it")
     with temporary_folder() as folder:
-        package, minifier = _installed(record, folder)
+        package, minifier = _install(record, folder)
         files = {"LICENSE": (package / "LICENSE").read_bytes()}
         for name, source in _SOURCES.items():
             # The words that put name and licence into the file's first line.
             banner = f"/*! {record['package']} {record['version']}, {record['license']}: see LICENSE */"
             options = ["--minify", "--charset=utf8", f"--banner:{name.rpartition('.')[2]}={banner}"]
-            files[name] = _output([minifier, package / source, *options])
+            files[name] = _run_command([minifier, package / source, *options])
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in sorted(files.items())}
     if digests != record["sha256"]:
         raise UserError(f"the files differ from those of {RECORD}; after a look at them, enter {json.dumps(digests)}")
@@ -51,15 +51,17 @@ def main(argv: Sequence[str] | None = None) -> None:
         print(f"{FOLDER / name}: {len(content):,} bytes")
 
 
-def _installed(record: dict, folder: Path) -> tuple[Path, Path]:
+def _install(record: dict, folder: Path) -> tuple[Path, Path]:
     """The package's folder, and the minifier."""
     named = f"{record['package']}@{record['version']}", f"esbuild@{record['esbuild']}"
-    _output([find_program("npm"), "install", "--silent", "--ignore-scripts", "--no-save", "--prefix", folder, *named])
+    _run_command(
+        [find_program("npm"), "install", "--silent", "--ignore-scripts", "--no-save", "--prefix", folder, *named]
+    )
     modules = folder / "node_modules"
     return modules / record["package"], modules / ".bin" / "esbuild"
 
 
-def _output(command: list[str | Path]) -> bytes:
+def _run_command(command: list[str | Path]) -> bytes:
     done = subprocess.run(command, capture_output=True)
     if done.returncode:
         raise UserError(f"{' '.join(map(str, command))} failed: {done.stderr.decode(errors='replace').strip()}")

@@ -1,4 +1,4 @@
-"""What a page's guests walk on and stop at: surfaces as voxels, in the form that the viewer reads.
+"""Solid surfaces, on which a page's guests walk and at which they stop: voxels, in the form that the viewer reads.
 
 The form is an octree (Laine and Karras 2010), breadth first: an inner node has a mask of its children in bits 24 to 31
 and the index of the first of them below, a leaf is SOLID or has the index of a mask of 4 x 4 x 4 voxels.
@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from applications.export.mesh import volume_of
+from applications.export.mesh import fuse_volume
 from applications.export.surfaces import Surfaces
 from applications.export.tsdf import TRUNCATION, Volume
-from applications.export.upright import moved_around, moved_splats
+from applications.export.upright import move_inputs, move_splats
 from gaussian_renderer.camera_paths.poses import poses_of
 from groundwork.files.similarity import Similarity
 from scene.cameras import Camera
@@ -23,7 +23,7 @@ from scene.splats.splats import Splats, opacities
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
-    from applications.export.formats import Around
+    from applications.export.formats import SceneInputs
 
 EYES = 1.5  # metres above the floor, of the viewer's walkers
 VOXEL = 0.05  # metres
@@ -45,26 +45,26 @@ class Solid(NamedTuple):
     content: bytes
 
 
-def walkable(splats: Splats, around: "Around") -> tuple[Splats, "Around"]:
-    """The splats, and what is beside them, upright and in metres, as the viewer's walkers are."""
-    from applications.export.html import turn_upright, up_of
+def make_walkable(splats: Splats, around: "SceneInputs") -> tuple[Splats, "SceneInputs"]:
+    """Move the splats, and the `SceneInputs` with them, upright and into metres, as the viewer's walkers are."""
+    from applications.export.html import find_up, turn_upright
 
     if not around.upright:
-        turn = turn_upright(up_of(poses_of(around.cameras)))
+        turn = turn_upright(find_up(poses_of(around.cameras)))
         upright = Similarity(turn, 1.0, np.zeros(3), splats.place, metric=around.metric)
-        splats, around = _moved(splats, around, upright)
+        splats, around = _move_all(splats, around, upright)
     if not around.metric:
-        scale = metres_of(splats, around.cameras)
+        scale = measure_metre(splats, around.cameras)
         print(f"--walk: photos are taken to be made {EYES} m above the floor, which makes a unit {scale:.3g} m")
-        splats, around = _moved(splats, around, Similarity(np.eye(3), scale, np.zeros(3), splats.place, metric=True))
+        splats, around = _move_all(splats, around, Similarity(np.eye(3), scale, np.zeros(3), splats.place, metric=True))
     return splats, around
 
 
-def _moved(splats: Splats, around: "Around", similarity: Similarity) -> tuple[Splats, "Around"]:
-    return moved_splats(splats, similarity), moved_around(around, similarity)
+def _move_all(splats: Splats, around: "SceneInputs", similarity: Similarity) -> tuple[Splats, "SceneInputs"]:
+    return move_splats(splats, similarity), move_inputs(around, similarity)
 
 
-def metres_of(splats: Splats, cameras: Sequence[Camera]) -> float:
+def measure_metre(splats: Splats, cameras: Sequence[Camera]) -> float:
     """The scale that puts the median camera EYES above the lowest surfaces. Arguments have y down.
 
     UserError where the cameras are not above them.
@@ -77,13 +77,13 @@ def metres_of(splats: Splats, cameras: Sequence[Camera]) -> float:
     return EYES / above
 
 
-def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Solid | None:
-    """The voxels of what the cameras see, and everywhere under it a floor with rails around. Metres, y down.
+def make_solid(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Solid | None:
+    """Make the voxels of the surfaces that cameras see, and a floor with rails under all of it. Metres, y down.
 
-    None, with a line, for a place that is narrower than LEAST.
+    A place that is narrower than LEAST has none: a line says so, and None is returned.
     """
-    volume = _volume(splats, cameras, pipe)
-    voxels, surface = _solid_voxels(volume)
+    volume = _fuse_coarser(splats, cameras, pipe)
+    voxels, surface = _find_solid_voxels(volume)
     level = int(np.quantile(voxels[surface, 1], 1 - _LOW))
     low, high = voxels.min(axis=0), voxels.max(axis=0)
     x, z = (np.arange(low[axis], high[axis] + 1) for axis in (0, 2))
@@ -96,15 +96,15 @@ def solid_of(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace
     if narrow:
         return None
     added = [np.stack(np.meshgrid(*ranges, indexing="ij"), -1).reshape(-1, 3) for ranges in floor]
-    return octree(np.concatenate([voxels, *added]) @ _TURN.astype(np.int64), volume.voxel)
+    return encode_octree(np.concatenate([voxels, *added]) @ _TURN.astype(np.int64), volume.voxel)
 
 
-def _volume(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Volume:
-    """Of voxels of VOXEL, or larger ones where the photos or the scene are too coarse or large for these."""
+def _fuse_coarser(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace) -> Volume:
+    """Make a volume with voxels of VOXEL, or of larger ones for photos that are too coarse or a scene too large."""
     surfaces = Surfaces(splats, cameras, pipe)
     for coarser in (1, 2, 4):
         try:
-            return volume_of(surfaces, coarser * VOXEL)
+            return fuse_volume(surfaces, coarser * VOXEL)
         except UserError as error:
             last = error
     said = (
@@ -113,7 +113,7 @@ def _volume(splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace)
     raise UserError(said) from last
 
 
-def _solid_voxels(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
+def _find_solid_voxels(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
     """(V, 3) int64: the voxels close behind a surface; and (V,) bool: those of them next to it."""
     places, near = [], []
     for origin, distances, known, _ in volume.chunks(_CHUNK, confirmed=1):
@@ -125,12 +125,12 @@ def _solid_voxels(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(places), np.concatenate(near)
 
 
-def octree(voxels: np.ndarray, size: float) -> Solid:
+def encode_octree(voxels: np.ndarray, size: float) -> Solid:
     """The files of solid voxels (V, 3) int64, of which (i, j, k) has its centre at `size` times (i, j, k)."""
     low = voxels.min(axis=0)
     blocks, within = np.divmod(voxels - low, LEAF)
     depth = max(1, math.ceil(math.log2(int(blocks.max()) + 1)))
-    codes = _morton(blocks, depth)
+    codes = _encode_morton(blocks, depth)
     leaves, block = np.unique(codes, return_inverse=True)
     bits = np.zeros((len(leaves), LEAF**3), bool)
     bits[block.reshape(-1), within @ np.array([1, LEAF, LEAF**2])] = True
@@ -164,7 +164,7 @@ def octree(voxels: np.ndarray, size: float) -> Solid:
     return Solid(json.dumps(about), nodes.tobytes() + masks.tobytes())
 
 
-def _morton(blocks: np.ndarray, depth: int) -> np.ndarray:
+def _encode_morton(blocks: np.ndarray, depth: int) -> np.ndarray:
     """(B,) int64: the bits of x, y and z by turns, x lowest."""
     codes = np.zeros(len(blocks), np.int64)
     for level in range(depth):

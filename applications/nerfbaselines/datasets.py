@@ -78,7 +78,7 @@ def scene_of(dataset: Mapping[str, Any], start: StartOptions) -> SceneInfo:
 
 
 def has_white_background(dataset: Mapping[str, Any]) -> bool:
-    """Whether transparent parts of the photos count as white."""
+    """Tell if transparent parts of the photos count as white."""
     color = dataset["metadata"].get("background_color")
     return color is not None and bool(np.all(np.asarray(color) == 255))
 

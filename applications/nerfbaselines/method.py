@@ -127,7 +127,7 @@ class GaussianSplatting(Method):
 
     @classmethod
     def get_method_info(cls) -> dict[str, Any]:
-        """What NerfBaselines has to know before it loads a dataset."""
+        """Return what NerfBaselines has to know before it loads a dataset."""
         return {
             "method_id": "",
             "required_features": frozenset(("color", "points3D_xyz", "points3D_rgb")),
@@ -138,7 +138,7 @@ class GaussianSplatting(Method):
         }
 
     def get_info(self) -> dict[str, Any]:
-        """The same with steps and options."""
+        """Return `get_method_info` with steps and options added."""
         model, opt, pipe = map(vars, self._options)
         options = vars(self._run.options) if self._run else model | opt | pipe
         return self.get_method_info() | {
@@ -170,7 +170,7 @@ class GaussianSplatting(Method):
         return told
 
     def _look(self) -> Any:
-        """A context in which the model is that after the last step."""
+        """Make a context in which the model is the one after the last step."""
         if self._run is None:
             return nullcontext()
         if self._at is not None:

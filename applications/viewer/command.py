@@ -16,9 +16,9 @@ from torch import Tensor
 
 from applications.viewer.page import Page, serve
 from applications.viewer.server import check_port
-from applications.viewer.untrained import untrained
+from applications.viewer.untrained import load_untrained
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, warn_of_background
-from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle, saved_scene, warn_if_moved
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle_cameras, saved_scene, warn_if_moved
 from groundwork.applications import VIEWER_PORT, application
 from scene.gaussians.morton import sort_scattered
 from scene.scene import Scene
@@ -31,28 +31,28 @@ from utils.general_utils import safe_state
 from utils.system_utils import UserError
 
 
-def of_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
-    """The model of a file, seen from a circle around it. `pipeline` gets antialiasing if the file says so."""
+def load_file(path: str, pipeline: argparse.Namespace) -> WithoutScene:
+    """Load the model of a file, seen from a circle around it. `pipeline` gets antialiasing if the file says so."""
     splats = application("export", "reading").read_any(path) if path.lower().endswith(".sog") else splats_in(path)
     splats = selected(splats, drawable(splats))
     pipeline.antialiasing = pipeline.antialiasing or splats.antialiasing
     folder, name = os.path.split(os.path.abspath(path))
     gaussians = model_of(splats)
     sort_scattered(gaussians)
-    return WithoutScene(gaussians, folder, name, circle(splats.means))
+    return WithoutScene(gaussians, folder, name, circle_cameras(splats.means))
 
 
-def of_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
-    """The model of a folder with its scene, or where that is gone with the poses that the folder records."""
+def load_folder(options: argparse.Namespace, args: argparse.Namespace) -> Scene | WithoutScene:
+    """Load the model of a folder with its scene, or with the poses that the folder records if the scene is gone."""
     scene = saved_scene(options, args.iteration, args.typed_sh_degree)
     warn_if_moved(options.model_path, scene.getTrainCameras())
     return scene
 
 
-def kept(
+def find_kept(
     scene: Scene | WithoutScene, args: argparse.Namespace, pipe: argparse.Namespace, options: argparse.Namespace
 ) -> Tensor | None:
-    """(N,) bool: what --clean leaves, None without it. UserError where the photos are gone."""
+    """Return a mask (N,) of the Gaussians that --clean leaves, None without it. UserError where photos are gone."""
     if not args.clean:
         return None
     if isinstance(scene, WithoutScene):
@@ -92,16 +92,16 @@ def main() -> None:
     check_port(args.port)
     safe_state(args.quiet)
     if args.file:
-        scene = of_file(args.file, pipeline)
+        scene = load_file(args.file, pipeline)
     elif before:
-        scene = untrained(options)
+        scene = load_untrained(options)
     else:
         warn_of_background(options)
-        scene = of_folder(options, args)
+        scene = load_folder(options, args)
     if len(scene.gaussians) == 0:
         raise UserError(f"{scene.loaded_iter} of {scene.model_path} has no Gaussians; choose another model")
     oriented = options.source_path if os.path.isdir(options.source_path or "") else ""
-    shown = kept(scene, args, pipeline, options), before, None if args.file else oriented
+    shown = find_kept(scene, args, pipeline, options), before, None if args.file else oriented
     page = Page(args.port, scene, pipeline, options.white_background, scene.halves, *shown)
     try:
         raise serve(page)

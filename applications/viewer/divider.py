@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from applications.viewer.views import window_of
-from gaussian_renderer.camera_paths.poses import opening
+from applications.viewer.views import read_window
+from gaussian_renderer.camera_paths.poses import vertical_fov
 from scene.cameras import Camera
 from utils.graphics_utils import camera_center
 
@@ -18,7 +18,7 @@ _KNOB, _LINE = 0.035, 0.004  # radius of the knob and half the width of the line
 _NAME = "/divider"
 
 
-def _shape() -> tuple[np.ndarray, np.ndarray]:
+def _make_shape() -> tuple[np.ndarray, np.ndarray]:
     """Corners and faces of a line of height 2 with a round knob in its middle."""
     angles = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     circle = _KNOB * np.column_stack([np.cos(angles), np.sin(angles), 0 * angles])
@@ -47,13 +47,13 @@ class Divider:
             return
         if drawn is None:
             drawn = self._drawn[client.client_id] = client.scene.add_mesh_simple(
-                _NAME, *_shape(), color=(255, 255, 255), side="double", cast_shadow=False, receive_shadow=False
+                _NAME, *_make_shape(), color=(255, 255, 255), side="double", cast_shadow=False, receive_shadow=False
             )
             drawn.on_drag(self._drag)
         from viser.transforms import SO3
 
         self._cameras[client.client_id] = camera
-        turn, slope = np.asarray(camera.R), np.tan(opening(camera) / 2)
+        turn, slope = np.asarray(camera.R), np.tan(vertical_fov(camera) / 2)
         across = (2 * share - 1) * slope * camera.image_width / camera.image_height
         drawn.position = camera_center(camera.R, camera.T) + self._away * (turn[:, 2] + across * turn[:, 0])
         drawn.wxyz, drawn.scale, drawn.visible = SO3.from_matrix(turn).wxyz, self._away * slope, True
@@ -61,15 +61,18 @@ class Divider:
     async def _drag(self, event: Any) -> None:
         camera = self._cameras.get(event.client_id)
         if camera is not None:
-            self._dragged(share_at(event.end_screen_pos[0], camera, *window_of(event.client.camera)))
+            self._dragged(find_share(event.end_screen_pos[0], camera, *read_window(event.client.camera)))
 
-    def left(self, client: int) -> None:
-        """A browser has gone."""
+    def remove_browser(self, client: int) -> None:
+        """Forget a browser that has gone."""
         self._drawn.pop(client, None)
         self._cameras.pop(client, None)
 
 
-def share_at(across: float, camera: Camera, width: int, height: int) -> float:
-    """Which part of a photo is left of a place in a window that shows all of it, 0 to 1 from its left edge."""
+def find_share(across: float, camera: Camera, width: int, height: int) -> float:
+    """Return the share of a photo's width that is left of a place in a window that shows the whole photo.
+
+    across: of the place, 0 to 1 from the window's left edge.
+    """
     shown = max(1.0, width / height * camera.image_height / camera.image_width)  # width, by that of the photo
     return min(max((across - 0.5) * shown + 0.5, 0.0), 1.0)

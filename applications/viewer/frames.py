@@ -12,14 +12,14 @@ import torch
 from torch import Tensor
 
 from applications.viewer import views
-from applications.viewer.coverage import Coverage, darkened
-from applications.viewer.legend import ERROR_SCALE, Legend, count_colors, depth_colors, error_image
-from applications.viewer.views import Pose, SceneCameras, Settings, Vector, canvas
+from applications.viewer.coverage import Coverage, darken_guesses
+from applications.viewer.legend import ERROR_SCALE, Legend, color_counts, color_depth, draw_error
+from applications.viewer.views import Pose, SceneCameras, Settings, Vector, fit_canvas
 from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth, view_planes
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from gaussian_renderer.median_depth import median_at
-from groundwork.files.image_files import dimmed, to_bytes
+from groundwork.files.image_files import dim_masked, to_bytes
 from scene.cameras import Camera, MiniCam
 from scene.gaussian_model import GaussianModel
 from utils.image_utils import as_float
@@ -64,7 +64,7 @@ class Frames:
         """
         camera = self.compared(settings, pose)
         if camera is None:
-            width, height = _size(pose, COARSE if coarse else 1)
+            width, height = _frame_size(pose, COARSE if coarse else 1)
             view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self.gaussians.get_xyz.device)
             image, words = self._image(settings, view)
             return Frame(to_bytes(image).numpy(), words._replace(warning=_NO_PHOTO if _needs_photo(settings) else ""))
@@ -73,13 +73,13 @@ class Frames:
             target = as_float(camera.target(self._background(settings)))
             drawn = self._image(settings, camera, target)
             if (counts := self.masks(camera)) is not None:
-                target = dimmed(target, counts)
+                target = dim_masked(target, counts)
             self._compared = key, (target, *drawn)
         target, image, words = self._compared[1]
         if settings.comparison == views.BESIDE and settings.mode == views.COLOUR:
             words = ERROR_SCALE  # of the third image
-        shown = to_bytes(_fitted(_composed(settings, target, image), pose)).numpy()
-        return Frame(shown, words._replace(sides=_sides(settings)))
+        shown = to_bytes(_fit_window(_compose(settings, target, image), pose)).numpy()
+        return Frame(shown, words._replace(sides=_describe_sides(settings)))
 
     def surface(self, settings: Settings, pose: Pose, ray: np.ndarray) -> np.ndarray | None:
         """The point (3,) of the surface along a ray (3,) of a pose's window; None where there is none.
@@ -87,14 +87,14 @@ class Frames:
         Its depth is the median in the pixel that the ray goes through.
         """
         axes, place = rotation_matrix(pose.wxyz), np.array(pose.position)
-        width, height = _size(pose)
+        width, height = _frame_size(pose)
         right, down, ahead = ray @ axes
         if ahead <= 0:
             return None
         focal = height / 2 / math.tan(pose.fov / 2)
         column, row = round((width - 1) / 2 + focal * right / ahead), round((height - 1) / 2 + focal * down / ahead)
         view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self.gaussians.get_xyz.device)
-        part = shown_part(self.gaussians, settings, self.kept)
+        part = select_shown(self.gaussians, settings, self.kept)
         depth = median_at(view, part, self._pipe, min(max(column, 0), width - 1), min(max(row, 0), height - 1))
         return place + depth / ahead * ray if depth else None
 
@@ -108,13 +108,13 @@ class Frames:
 
     def _image(self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None) -> tuple[Tensor, Legend]:
         """The mode's image (3, H, W) in [0, 1]. Without a target there is no error, and the colour is drawn."""
-        part = shown_part(self.gaussians, settings, self.kept)
+        part = select_shown(self.gaussians, settings, self.kept)
         if settings.mode == views.COUNT:
-            return count_colors(blend_depth(view, part, self._pipe, settings.scaling))
+            return color_counts(blend_depth(view, part, self._pipe, settings.scaling))
         if settings.mode in (views.DEPTH, views.OPACITY):
             planes = view_planes(view, part, self._pipe, settings.scaling)
             if settings.mode == views.DEPTH:
-                return depth_colors(planes["depth"], planes["alpha"])
+                return color_depth(planes["depth"], planes["alpha"])
             return planes["alpha"].expand(3, -1, -1), Legend()
         exposed = self._with_exposures and target is not None
         coverage = self.coverage if settings.darken and target is None else None
@@ -124,13 +124,13 @@ class Frames:
         drawn = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)
         colour = drawn["render"]
         if coverage is not None:
-            return darkened(colour, drawn["features"]), Legend()
+            return darken_guesses(colour, drawn["features"]), Legend()
         if settings.mode == views.ERROR and target is not None:
-            return error_image(target, colour), ERROR_SCALE
+            return draw_error(target, colour), ERROR_SCALE
         return colour, Legend()
 
 
-def _size(pose: Pose, coarser: int = 1) -> tuple[int, int]:
+def _frame_size(pose: Pose, coarser: int = 1) -> tuple[int, int]:
     """The width and height of a frame, in pixels."""
     scale = min(1.0, LONGEST / max(pose.width, pose.height)) / coarser
     return max(1, round(pose.width * scale)), max(1, round(pose.height * scale))
@@ -140,8 +140,8 @@ def _needs_photo(settings: Settings) -> bool:
     return settings.comparison != views.ALONE or settings.mode == views.ERROR
 
 
-def _sides(settings: Settings) -> str:
-    """Which of the images of `_composed` is where."""
+def _describe_sides(settings: Settings) -> str:
+    """Say which image is where in the frame of `_compose`."""
     shown = "render" if settings.mode == views.COLOUR else settings.mode.lower()
     error = ", error" if settings.mode == views.COLOUR else ""
     sides = {
@@ -151,28 +151,28 @@ def _sides(settings: Settings) -> str:
     return sides.get(settings.comparison, "")
 
 
-def _composed(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
+def _compose(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
     if settings.comparison == views.ALONE:
         return image
     if settings.comparison == views.BESIDE:
         panels = [target, image]
         if settings.mode == views.COLOUR:
-            panels.append(error_image(target, image))
+            panels.append(draw_error(target, image))
         return torch.cat(panels, dim=2)
     width = target.shape[2]
     column = round(min(max(settings.slider, 0.0), 1.0) * width)
     return torch.cat([target[:, :, :column], image[:, :, column:]], dim=2)
 
 
-def _fitted(image: Tensor, pose: Pose) -> Tensor:
+def _fit_window(image: Tensor, pose: Pose) -> Tensor:
     """The image in the middle of a canvas of the window's aspect, not larger than LONGEST."""
     aspect = pose.width / pose.height
-    shrink = max(canvas(image.shape[2], image.shape[1], aspect)) / LONGEST
+    shrink = max(fit_canvas(image.shape[2], image.shape[1], aspect)) / LONGEST
     if shrink > 1:
         size = [max(1, round(side / shrink)) for side in image.shape[1:]]
         image = torch.nn.functional.interpolate(image[None], size, mode="area")[0]
     height, width = image.shape[1:]
-    wide, high = canvas(width, height, aspect)
+    wide, high = fit_canvas(width, height, aspect)
     fitted = image.new_full((3, high, wide), _BORDER)
     top, left = (high - height) // 2, (wide - width) // 2
     fitted[:, top : top + height, left : left + width] = image
@@ -180,10 +180,10 @@ def _fitted(image: Tensor, pose: Pose) -> Tensor:
 
 
 @torch.no_grad()
-def shown_part(gaussians: GaussianModel, settings: Settings, kept: Tensor | None = None) -> GaussianModel:
+def select_shown(gaussians: GaussianModel, settings: Settings, kept: Tensor | None = None) -> GaussianModel:
     """The Gaussians in the crop box that cleaning keeps or leaves out, with the settings' SH degree at most."""
     degree = min(settings.sh_degree, gaussians.active_sh_degree)
-    chosen = [] if settings.crop is None else [inside(gaussians.get_xyz, *settings.crop)]
+    chosen = [] if settings.crop is None else [find_inside(gaussians.get_xyz, *settings.crop)]
     if kept is not None and settings.cleaning != views.WHOLE:
         chosen.append(kept if settings.cleaning == views.STAYS else ~kept)
     if chosen:
@@ -196,7 +196,7 @@ def shown_part(gaussians: GaussianModel, settings: Settings, kept: Tensor | None
     return part
 
 
-def inside(positions: Tensor, one: Vector, other: Vector) -> Tensor:
+def find_inside(positions: Tensor, one: Vector, other: Vector) -> Tensor:
     """(N,) bool: which positions (N, 3) lie in the box with these opposite corners."""
     corners = positions.new_tensor([one, other])
     return ((positions >= corners.amin(0)) & (positions <= corners.amax(0))).all(1)

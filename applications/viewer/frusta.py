@@ -1,4 +1,4 @@
-"""The scene's cameras as each browser draws them. Those near its own camera fade: they would fill its window."""
+"""The scene's cameras as each browser draws them. Cameras near its own fade, as they would fill its window."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ _APEX_AND_CORNERS = np.float32([[0, 0, 0], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [
 _FACES = np.uint32([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]])
 
 
-def faded(distances: np.ndarray) -> np.ndarray:
+def fade_opacities(distances: np.ndarray) -> np.ndarray:
     """Opacities (N,) in [0, 1] of drawn cameras, by their distances in lengths of a drawn camera."""
     return np.round(np.clip((distances - _GONE) / (_WHOLE - _GONE), 0, 1) * _SHADES) / _SHADES
 
@@ -50,7 +50,7 @@ class Frusta:
         self._chosen = chosen
         self._visible = visible
 
-    def came(self, client: "viser.ClientHandle") -> None:
+    def add_browser(self, client: "viser.ClientHandle") -> None:
         """Draw the cameras for a browser."""
         if not self.names:
             return
@@ -66,7 +66,7 @@ class Frusta:
         if event.instance_index in range(len(self.names)):
             self._chosen(event, self.names[event.instance_index])
 
-    def moved(self, client: "viser.ClientHandle") -> None:
+    def update_browser(self, client: "viser.ClientHandle") -> None:
         """Fade what is near the camera of a browser."""
         drawn = self._drawn.get(client.client_id)
         opacities = self._opacities(client.camera.position)
@@ -74,8 +74,8 @@ class Frusta:
             with client.atomic():
                 drawn.batched_opacities, drawn.batched_scales = opacities, self._scales(opacities)
 
-    def left(self, client_id: int) -> None:
-        """A browser has gone."""
+    def remove_browser(self, client_id: int) -> None:
+        """Forget a browser that has gone."""
         self._drawn.pop(client_id, None)
 
     def show(self, visible: bool) -> None:
@@ -85,7 +85,7 @@ class Frusta:
             drawn.visible = visible
 
     def _opacities(self, position: np.ndarray) -> np.ndarray:
-        return faded(np.linalg.norm(self._places - position, axis=1) / self._length).astype(np.float32)
+        return fade_opacities(np.linalg.norm(self._places - position, axis=1) / self._length).astype(np.float32)
 
     def _scales(self, opacities: np.ndarray) -> np.ndarray:
         """Sizes (N, 3); one that cannot be seen has none, so that no click meets it."""

@@ -26,23 +26,23 @@ class Legend(NamedTuple):
     warning: str = ""
     sides: str = ""
 
-    def html(self) -> str:
-        """What the page shows; empty if there is nothing to say."""
+    def make_html(self) -> str:
+        """Make the HTML of the legend; empty if there is nothing to show."""
         parts = [text for text in (self.warning, self.sides, self.title) if text]
         if self.numbers:
             colours = ", ".join(f"rgb({', '.join(f'{100 * x:g}%' for x in stop)})" for stop in self.stops)
             parts.append(f'<div style="height:0.8em;background:linear-gradient(to right, {colours})"></div>')
-            numbers = "".join(f"<span>{_short(number)}</span>" for number in self.numbers)
+            numbers = "".join(f"<span>{_shorten(number)}</span>" for number in self.numbers)
             parts.append(f'<div style="display:flex;justify-content:space-between">{numbers}</div>')
         content = "".join(f"<div>{part}</div>" for part in parts)
         return f'<div style="padding:0 0.8em 0.4em;font-size:0.85em;line-height:1.4">{content}</div>' if parts else ""
 
 
-def _short(number: float) -> str:
+def _shorten(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
-def colored(values: Tensor) -> Tensor:
+def apply_colors(values: Tensor) -> Tensor:
     """Colours (3, H, W) of values (H, W) in [0, 1], linear between the stops; others are clamped."""
     stops = torch.tensor(_STOPS, dtype=values.dtype, device=values.device)
     place = values.clamp(0, 1) * (len(_STOPS) - 1)
@@ -50,7 +50,7 @@ def colored(values: Tensor) -> Tensor:
     return torch.lerp(stops[below], stops[below + 1], (place - below)[..., None]).permute(2, 0, 1)
 
 
-def depth_colors(depth: Tensor, alpha: Tensor) -> tuple[Tensor, Legend]:
+def color_depth(depth: Tensor, alpha: Tensor) -> tuple[Tensor, Legend]:
     """Colours (3, H, W) of the planes of `view_planes`, (1, H, W) each; depth is inverse: near is bright.
 
     Where less than half of a pixel is covered there is no depth, and the colour is black.
@@ -64,17 +64,17 @@ def depth_colors(depth: Tensor, alpha: Tensor) -> tuple[Tensor, Legend]:
     far, near = torch.quantile(known, torch.tensor([_FEW, _MOST], dtype=known.dtype, device=known.device)).tolist()
     span = max(near - far, 1e-9)
     numbers = tuple(1 / max(far + tick * span, 1e-9) for tick in _TICKS)
-    colours = torch.where(there, colored((values - far) / span), 0.0)
+    colours = torch.where(there, apply_colors((values - far) / span), 0.0)
     return colours, Legend("Depth, far to near, in units of the scene", numbers)
 
 
-def count_colors(counts: Tensor) -> tuple[Tensor, Legend]:
+def color_counts(counts: Tensor) -> tuple[Tensor, Legend]:
     """Colours (3, H, W) of counts (H, W): linear, the largest of the image is the brightest."""
     most = max(int(counts.max()), 1)
-    return colored(counts.float() / most), Legend("Gaussians per pixel", tuple(tick * most for tick in _TICKS))
+    return apply_colors(counts.float() / most), Legend("Gaussians per pixel", tuple(tick * most for tick in _TICKS))
 
 
-def error_image(target: Tensor, render: Tensor) -> Tensor:
+def draw_error(target: Tensor, render: Tensor) -> Tensor:
     """The difference (3, H, W) of two images in [0, 1], times ERROR_GAIN."""
     return ((target - render).abs() * ERROR_GAIN).clamp(0, 1)
 

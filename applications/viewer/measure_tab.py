@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from applications.viewer.tabs import Tell, serialized
-from applications.viewer.views import Pose, SceneCameras, pose_of
+from applications.viewer.tabs import Refuse, serialize
+from applications.viewer.views import Pose, SceneCameras, read_pose
 from groundwork.files.json_files import MODEL_JSON, read_model_json, write_json
 from groundwork.files.measured import ground_normal, measured_record
 from groundwork.files.similarity import ENTRY, FILE, Similarity, read_orientation, recorded_similarity
@@ -32,7 +32,7 @@ Find = Callable[[Pose, np.ndarray, Callable[[np.ndarray | None], None]], None]
 
 
 class Place:
-    """Where a model's orientation is kept. folder: of the model; scene: its folder, "" without one."""
+    """Files that keep a model's orientation. folder: of the model; scene: its folder, "" without one."""
 
     def __init__(self, folder: Path, scene: str, offset: tuple[float, float, float]) -> None:
         self._folder, self._scene, self.offset = folder, scene, np.array(offset, np.float64)
@@ -43,8 +43,8 @@ class Place:
 
     @property
     def unit(self) -> tuple[float, str]:
-        """What a unit of the scene is, and of what."""
-        known = self.record and Similarity.of(self.record, "orientation")
+        """Return the length of a unit of the scene, and in which unit that length is."""
+        known = self.record and Similarity.read(self.record, "orientation")
         return (known.scale, "m") if known and known.metric else (1.0, "units of the scene")
 
     def write(self, record: dict[str, Any]) -> list[Path]:
@@ -74,9 +74,12 @@ class Place:
 
 
 class MeasureTab:
-    """Controls for what to click, and points. find: calls back with the place of the surface along a ray, or None.
+    """Controls for what to click, and points.
 
-    place: where to keep what was set, None: nowhere. told: called with what was done and the files that were written.
+    find: calls back with the place of the surface along a ray, or None.
+    place: where to keep what was set, None: nowhere.
+    report: called with a browser, what was done and the files that were written.
+    refuse: called with a browser and a UserError.
     """
 
     def __init__(
@@ -85,8 +88,8 @@ class MeasureTab:
         cameras: SceneCameras,
         find: Find,
         place: Place | None,
-        told: Callable[[Any, str, list[Path]], None],
-        tell: Tell,
+        report: Callable[[Any, str, list[Path]], None],
+        refuse: Refuse,
     ) -> None:
         gui, self._server, self._cameras, self._find, self._place = server.gui, server, cameras, find, place
         self.points: dict[str, list[np.ndarray]] = {tool: [] for tool in _POINTS}
@@ -98,11 +101,11 @@ class MeasureTab:
         clear = gui.add_button("Clear", color="gray")
         self.keep = gui.add_button("Set right", hint="scale, upright and front, for exports", disabled=True)
         self.back = gui.add_button("As before", hint="take the last “Set right” back", color="gray", disabled=True)
-        self.tool.on_update(serialized(lambda _: self._choose()))
-        self.metres.on_update(serialized(lambda _: self._show()))
-        clear.on_click(serialized(lambda _: self._clear()))
-        self.keep.on_click(serialized(lambda event: told(event.client, "Set right", self.write()), tell))
-        self.back.on_click(serialized(lambda event: told(event.client, "As before", self.restore()), tell))
+        self.tool.on_update(serialize(lambda _: self._choose()))
+        self.metres.on_update(serialize(lambda _: self._show()))
+        clear.on_click(serialize(lambda _: self._clear()))
+        self.keep.on_click(serialize(lambda event: report(event.client, "Set right", self.write()), refuse))
+        self.back.on_click(serialize(lambda event: report(event.client, "As before", self.restore()), refuse))
 
     def _choose(self) -> None:
         """Listen to clicks while there is something to click."""
@@ -112,7 +115,7 @@ class MeasureTab:
         self._show()
 
     async def _clicked(self, event: Any) -> None:
-        pose, tool = pose_of(event.client.camera), self.tool.value
+        pose, tool = read_pose(event.client.camera), self.tool.value
         if pose is not None and tool in _POINTS:
             self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point))
 
@@ -134,7 +137,7 @@ class MeasureTab:
 
     @property
     def length(self) -> float | None:
-        """Of the two points, in the scene's unit; None without them."""
+        """Return the distance of the two points, in the scene's unit; None without them."""
         ends = self._whole(LENGTH)
         return None if ends is None else float(np.linalg.norm(ends[1] - ends[0]))
 
@@ -180,7 +183,7 @@ class MeasureTab:
         moved = {tool: None if (it := self._whole(tool)) is None else it + self._place.offset for tool in _POINTS}
         above = self._cameras.middle + self._place.offset
         record = measured_record(self._place.record, above, scale, moved[GROUND], moved[FRONT])
-        Similarity.of(record, "what was measured")  # a scale that no scene has
+        Similarity.read(record, "what was measured")  # a scale that no scene has
         files = self._place.write(record)
         self._show()
         return files

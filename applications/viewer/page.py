@@ -14,14 +14,14 @@ from tqdm import tqdm
 
 from applications.viewer import server as servers
 from applications.viewer.coverage import Coverage
-from applications.viewer.frames import LONGEST, Frames, inside
+from applications.viewer.frames import LONGEST, Frames, find_inside
 from applications.viewer.legend import Legend
 from applications.viewer.measure_tab import MeasureTab, Place
 from applications.viewer.path_tab import PathTab
 from applications.viewer.photos_tab import ImagesTab
-from applications.viewer.tabs import ViewTab, serialized
+from applications.viewer.tabs import ViewTab, serialize
 from applications.viewer.training_tab import Requests
-from applications.viewer.views import Pose, SceneCameras, Settings, Vector, pose_of, window_of
+from applications.viewer.views import Pose, SceneCameras, Settings, Vector, read_pose, read_window
 from applications.viewer.watchers import Watchers, Wish
 from gaussian_renderer.camera_paths.without_scene import WithoutScene
 from groundwork.host.interrupt import DeferredInterrupt
@@ -90,22 +90,22 @@ class Page:
         self.tabs = gui.add_tab_group()
         # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.
         photos = not isinstance(scene, WithoutScene)
-        degree = gaussians.max_sh_degree if scene.loaded_iter is None else used_degree(gaussians)
+        degree = gaussians.max_sh_degree if scene.loaded_iter is None else find_used_degree(gaussians)
         with self.tabs.add_tab("View"):
             background = (1.0, 1.0, 1.0) if white else (0.0, 0.0, 0.0)
-            calls = self.watchers.changed, lambda: self.requests.ask(self.export_crop)
+            calls = self.watchers.note_change, lambda: self.requests.ask(self.export_crop)
             of_model = folder / CROPS, gaussians.get_xyz, degree
             known = kept is not None, photos, self.frames.coverage is not None
             self.view = ViewTab(self.server, *calls, *of_model, background, *known)
         with self.tabs.add_tab("Photos"):
-            self.images = ImagesTab(self.server, self.watchers.changed, self._cameras, untrained, photos)
+            self.images = ImagesTab(self.server, self.watchers.note_change, self._cameras, untrained, photos)
         with self.tabs.add_tab("Path"):
             self.path = PathTab(self.server, folder / PATHS, self._cameras, self._refuse)
         if untrained or scene.loaded_iter is not None:  # a model that trains moves
             place = None if oriented is None else Place(folder, oriented, gaussians.world_offset)
             with self.tabs.add_tab("Measure"):
-                self.measure = MeasureTab(self.server, self._cameras, self._find, place, self._tell_set, self._refuse)
-        self.path.saved.on_click(serialized(lambda event: self._save_path(event.client, folder), self._refuse))
+                self.measure = MeasureTab(self.server, self._cameras, self._find, place, self._report_set, self._refuse)
+        self.path.saved.on_click(serialize(lambda event: self._save_path(event.client, folder), self._refuse))
         self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
         self.server.initial_camera.near = 1e-3 * self._cameras.size
         self.server.initial_camera.far = 1e3 * self._cameras.size
@@ -115,20 +115,20 @@ class Page:
     # Coroutines, so that viser calls them one after the other: a browser that has left stays away.
     async def _came(self, client: "viser.ClientHandle") -> None:
         async def moved(camera: "viser.CameraHandle") -> None:
-            self.images.moved(client)
-            pose = pose_of(camera)
+            self.images.update_browser(client)
+            pose = read_pose(camera)
             if pose is not None:
-                self.watchers.moved(client.client_id, pose)
+                self.watchers.update_browser(client.client_id, pose)
 
         self.path.list_files()
         self._legends[client.client_id] = client.gui.add_html("", order=self.count.order + 0.5, visible=False)
-        self.images.frusta.came(client)
+        self.images.frusta.add_browser(client)
         await moved(client.camera)
         client.camera.on_update(moved)
 
     async def _left(self, client: "viser.ClientHandle") -> None:
-        self.watchers.left(client.client_id)
-        self.images.left(client.client_id)
+        self.watchers.remove_browser(client.client_id)
+        self.images.remove_browser(client.client_id)
         self._legends.pop(client.client_id, None)
         self._faults.pop(client.client_id, None)
 
@@ -138,13 +138,13 @@ class Page:
         self.show_numbers(iteration, len(gaussians))
 
     def settings(self) -> Settings:
-        """What the controls say now."""
+        """Read the settings from the controls."""
         return self.images.read(self.view.read())
 
     def fulfil(self, wish: Wish, version: int = 0) -> None:
         """Draw and send the frame of a wish. One that cannot be drawn ends nothing. version: of the model."""
         try:
-            self.watchers.drew(wish, version)
+            self.watchers.note_drawing(wish, version)
             image, legend = self.frames.draw(self.settings(), wish.pose, wish.coarse, version)
             client = self.server.get_clients().get(wish.client)
             if client is not None:  # it has not left
@@ -165,7 +165,7 @@ class Page:
         self._notify(client, "Not done", str(error), color="red")
 
     def _explain(self, client: int, legend: Legend) -> None:
-        shown, text = self._legends.get(client), legend.html()
+        shown, text = self._legends.get(client), legend.make_html()
         if shown is not None and shown.content != text:
             shown.content, shown.visible = text, bool(text)
 
@@ -220,33 +220,33 @@ class Page:
 
         self.requests.ask(ask)
 
-    def _tell_set(self, client: "viser.ClientHandle", what: str, files: list[Path]) -> None:
+    def _report_set(self, client: "viser.ClientHandle", what: str, files: list[Path]) -> None:
         names = " and ".join(map(str, files))
         tqdm.write(as_utf8(f"{what}; written into {names}"), file=sys.stdout)
-        self._notify(client, what, f"exports of this scene stand so from now on: {names}")
+        self._notify(client, what, f"exports of this scene follow it from now on: {names}")
 
     def _save_path(self, client: "viser.ClientHandle", folder: Path) -> None:
         replaced, file = self.path.file.replaced(), self.path.save()
-        size = (max(2, side - side % 2) for side in window_of(client.camera))
+        size = (max(2, side - side % 2) for side in read_window(client.camera))
         words = shlex.join(map(str, ("-m", folder, "--path", file, "--size", *size)))
         tqdm.write(as_utf8(f"Saved {file}{replaced}; its video: {typed_command('render.py')} {words}"), file=sys.stdout)
         self._notify(client, "Saved", f"{PATHS}/{file.name}{replaced}; the terminal shows how to make its video")
 
     def stop(self) -> None:
-        """Stop to listen."""
+        """Stop listening."""
         self.path.stop()
         servers.stop(self.server)
 
 
-def used_degree(gaussians: GaussianModel) -> int:
+def find_used_degree(gaussians: GaussianModel) -> int:
     """The highest SH degree of which a coefficient is not zero."""
     used = gaussians.get_features_rest.detach().any(0).any(1).nonzero()
     return int((int(used.max()) + 1) ** 0.5) if len(used) else 0
 
 
 def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector], antialiasing: bool) -> int:
-    """Write the Gaussians in a box, given by opposite corners, as export.py does; how many. UserError without any."""
-    part = gaussians.part(inside(gaussians.get_xyz, *box), gaussians.active_sh_degree)
+    """Write the Gaussians in a box, given by opposite corners; return their number. UserError without any."""
+    part = gaussians.part(find_inside(gaussians.get_xyz, *box), gaussians.active_sh_degree)
     splats = splats_of(part, antialiasing)
     splats = tidy(selected(splats, drawable(splats)))
     if not len(splats):
@@ -256,7 +256,7 @@ def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector],
 
 
 def serve(page: Page) -> type[KeyboardInterrupt] | None:
-    """Do what browsers ask for until a signal comes, which is returned, or until one of them closes the page."""
+    """Do what browsers ask for, until one of them closes the page or a signal comes; return the signal's exception."""
     with DeferredInterrupt() as interrupt:
         while not interrupt.requested and not page.requests.stopped:
             answer(page)
@@ -266,7 +266,7 @@ def serve(page: Page) -> type[KeyboardInterrupt] | None:
 def answer(page: Page) -> bool:
     """Do what a button asked for, draw and send the next frame that somebody waits for, or wait a little.
 
-    Whether there was a frame.
+    Returns True if there was a frame.
     """
     page.requests.work()
     wish = page.watchers.next()

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from applications.viewer.tabs import FileName, Tell, serialized
-from applications.viewer.views import SceneCameras, pose_of
+from applications.viewer.tabs import FileName, Refuse, serialize
+from applications.viewer.views import SceneCameras, read_pose
 from gaussian_renderer.camera_paths.keyframes import EASINGS, CameraPath, Keyframe, KeyframePath, read_camera_path
 from gaussian_renderer.free_view import rotation_matrix
 from utils.system_utils import UserError
@@ -27,10 +27,10 @@ _NONE = "none yet"
 class PathTab:
     """Controls that record the browser's view as a keyframe, go to one or delete it, and play, save and open a path.
 
-    folder: for the files of paths. tell: called with a browser and what it asked for in vain.
+    folder: for the files of paths. refuse: called with a browser and a UserError.
     """
 
-    def __init__(self, server: "viser.ViserServer", folder: Path, cameras: SceneCameras, tell: Tell) -> None:
+    def __init__(self, server: "viser.ViserServer", folder: Path, cameras: SceneCameras, refuse: Refuse) -> None:
         gui, self._server, self._cameras = server.gui, server, cameras
         self.keyframes: list[Keyframe] = []
         self._playing: asyncio.Task | None = None
@@ -45,10 +45,13 @@ class PathTab:
         self.saved = gui.add_button("Save the path")
         self.files = gui.add_dropdown("Saved paths", (_NONE,))
         opened = gui.add_button("Open the path", hint="in place of the keyframes above")
-        self.chosen.on_update(serialized(lambda event: self.go(event.client), tell))
-        buttons, calls = (add, again, delete, self.play, opened), (self.add, self.go, self.delete, self.turn, self.open)
+        self.chosen.on_update(serialize(lambda event: self.move_to_keyframe(event.client), refuse))
+        buttons, calls = (
+            (add, again, delete, self.play, opened),
+            (self.add, self.move_to_keyframe, self.delete, self.toggle_playing, self.open),
+        )
         for button, call in zip(buttons, calls, strict=True):
-            button.on_click(serialized(lambda event, call=call: call(event.client), tell))
+            button.on_click(serialize(lambda event, call=call: call(event.client), refuse))
         self._of_one, self._of_two, self._of_file = (again, delete), (self.play, self.saved), opened
         self._grey()
         self.list_files()
@@ -61,7 +64,7 @@ class PathTab:
 
     def add(self, client: "viser.ClientHandle") -> None:
         """Append the view of a browser, with what its window shows from top to bottom, if there is room for it."""
-        pose = pose_of(client.camera)
+        pose = read_pose(client.camera)
         if pose is None:
             return
         if len(self.keyframes) >= _MOST:
@@ -81,7 +84,7 @@ class PathTab:
         first = self.keyframes[0].seconds if self.keyframes else 0.0
         self.keyframes = [replace(key, seconds=round(key.seconds - first, 3)) for key in self.keyframes]
         self._list(min(index, len(self.keyframes) - 1))
-        self.go(client if self.keyframes else None)
+        self.move_to_keyframe(client if self.keyframes else None)
 
     def _list(self, index: int) -> None:
         """List the keyframes, and choose one."""
@@ -95,7 +98,7 @@ class PathTab:
             raise UserError("no keyframe is chosen; add a view, or choose one of the list")
         return self.chosen.options.index(self.chosen.value)
 
-    def go(self, client: "viser.ClientHandle | None") -> None:
+    def move_to_keyframe(self, client: "viser.ClientHandle | None") -> None:
         """Move a browser's camera to the chosen keyframe. None: the list has changed by itself."""
         if client is not None:
             self._move(client, self.keyframes[self._index()])
@@ -103,7 +106,7 @@ class PathTab:
     def _move(self, client: "viser.ClientHandle", key: Keyframe) -> None:
         self._cameras.move(client, np.array(key.position), rotation_matrix(key.wxyz), math.radians(key.fov))
 
-    def turn(self, client: "viser.ClientHandle") -> None:
+    def toggle_playing(self, client: "viser.ClientHandle") -> None:
         """Move a browser's camera along the path in real time, or stop if that is under way."""
         if self._playing is not None:
             return self.stop()
@@ -112,7 +115,7 @@ class PathTab:
         self.play.label = "Stop"
 
     def stop(self) -> None:
-        """Stop to play. May be called from any thread."""
+        """Stop playing. May be called from any thread."""
         if playing := self._playing:
             playing.get_loop().call_soon_threadsafe(playing.cancel)
 
@@ -153,4 +156,4 @@ class PathTab:
         self.file.field.value, path = name, read_camera_path(self.file.folder / f"{name}.json")
         self.keyframes, self.easing.value = list(path.keyframes), path.easing
         self._list(0)
-        self.go(client)
+        self.move_to_keyframe(client)

@@ -9,10 +9,10 @@ import numpy as np
 from applications.viewer import views
 from applications.viewer.divider import Divider
 from applications.viewer.frusta import Frusta
-from applications.viewer.tabs import serialized
+from applications.viewer.tabs import serialize
 from applications.viewer.views import SceneCameras, Settings
-from gaussian_renderer.camera_paths.poses import opening
-from gaussian_renderer.camera_paths.start import narrowed
+from gaussian_renderer.camera_paths.poses import vertical_fov
+from gaussian_renderer.camera_paths.start import narrow_fov
 from utils.graphics_utils import camera_center
 
 if TYPE_CHECKING:
@@ -49,14 +49,14 @@ class ImagesTab:
         self._windows: dict[int, tuple[int, int]] = {}  # of browsers, to which their opening angles fit
         self._begin()
         # In turn, so that the view does not get its place from one camera and its direction from the next.
-        self.camera.on_update(serialized(lambda event: (self._begin(), self.go(event.client))))
-        again.on_click(serialized(lambda event: self.go(event.client)))
-        self.comparison.on_update(serialized(lambda event: (self._compare(event.client), changed(False))))
-        self.slider.on_update(serialized(lambda _: (self._divide(), changed(True))))
-        shown.on_update(serialized(lambda _: (self.frusta.show(shown.value), setattr(colours, "visible", shown.value))))
+        self.camera.on_update(serialize(lambda event: (self._begin(), self.move_to_camera(event.client))))
+        again.on_click(serialize(lambda event: self.move_to_camera(event.client)))
+        self.comparison.on_update(serialize(lambda event: (self._compare(event.client), changed(False))))
+        self.slider.on_update(serialize(lambda _: (self._divide(), changed(True))))
+        shown.on_update(serialize(lambda _: (self.frusta.show(shown.value), setattr(colours, "visible", shown.value))))
 
     def read(self, settings: Settings) -> Settings:
-        """The settings, with what these controls say."""
+        """Add the settings of these controls."""
         return replace(settings, camera=self.camera.value, comparison=self.comparison.value, slider=self.slider.value)
 
     def _begin(self) -> None:
@@ -65,22 +65,22 @@ class ImagesTab:
         if camera is None:
             return
         place, axes, up = camera_center(camera.R, camera.T), np.asarray(camera.R), self._cameras.up_at(camera.R)
-        target, fov = self._cameras.target_of(place, axes), opening(camera)
+        target, fov = self._cameras.target_of(place, axes), vertical_fov(camera)
         if self._all_drawn:
             place, axes, target = self._cameras.overview()
             up, fov = self._cameras.up, views.overview_fov(1.0)
         initial.position, initial.look_at, initial.up, initial.fov = place, target, tuple(up), fov
         self._beginning = place, axes
 
-    def moved(self, client: "viser.ClientHandle") -> None:
-        """A browser's camera is elsewhere, or its window has another size."""
+    def update_browser(self, client: "viser.ClientHandle") -> None:
+        """Follow a browser whose camera has moved, or whose window has another size."""
         self._fit(client)
         self._divide()
-        self.frusta.moved(client)
+        self.frusta.update_browser(client)
 
     def _fit(self, client: "viser.ClientHandle") -> None:
-        """Fit the opening angle of a browser that is where it began to its window, if that is new or has changed."""
-        camera, pose = self._cameras.by_name.get(self.camera.value), views.pose_of(client.camera)
+        """Fit the opening angle to a browser's window if that is new or has changed, and the camera has not moved."""
+        camera, pose = self._cameras.by_name.get(self.camera.value), views.read_pose(client.camera)
         if camera is None or pose is None or not self._cameras.stands_at(pose, *self._beginning):
             return
         window, before = (pose.width, pose.height), self._windows.get(client.client_id)
@@ -91,21 +91,21 @@ class ImagesTab:
         if self._all_drawn:
             client.camera.fov = views.overview_fov(aspect)
         elif self.comparison.value == views.ALONE:
-            client.camera.fov = narrowed(opening(camera), camera.image_width / camera.image_height, aspect)
+            client.camera.fov = narrow_fov(vertical_fov(camera), camera.image_width / camera.image_height, aspect)
         else:
-            client.camera.fov = views.fov_of_canvas(camera, aspect)
+            client.camera.fov = views.fit_fov(camera, aspect)
 
-    def left(self, client: int) -> None:
-        """A browser has gone."""
-        self.frusta.left(client)
-        self._divider.left(client)
+    def remove_browser(self, client: int) -> None:
+        """Forget a browser that has gone."""
+        self.frusta.remove_browser(client)
+        self._divider.remove_browser(client)
         self._windows.pop(client, None)
 
     def _divide(self) -> None:
         """Draw the line between photo and render for those who see both."""
         camera, slides = self._cameras.by_name.get(self.camera.value), self.comparison.value == views.SLIDER
         for client in self._server.get_clients().values():
-            pose = views.pose_of(client.camera)
+            pose = views.read_pose(client.camera)
             there = slides and pose is not None and camera is not None and self._cameras.stands_at_camera(pose, camera)
             self._divider.place(client, camera if there else None, self.slider.value)
 
@@ -115,17 +115,17 @@ class ImagesTab:
     def _compare(self, client: "viser.ClientHandle | None") -> None:
         self.slider.visible = self.comparison.value == views.SLIDER
         if self.comparison.value != views.ALONE:
-            self.go(client)
+            self.move_to_camera(client)
         self._divide()
 
-    def go(self, client: "viser.ClientHandle | None") -> None:
+    def move_to_camera(self, client: "viser.ClientHandle | None") -> None:
         """Move a browser's camera to the chosen one."""
         camera = self._cameras.by_name.get(self.camera.value)
         if client is not None and camera is not None:
-            width, height = views.window_of(client.camera)
-            place, fov = camera_center(camera.R, camera.T), views.fov_of_canvas(camera, width / height)
+            width, height = views.read_window(client.camera)
+            place, fov = camera_center(camera.R, camera.T), views.fit_fov(camera, width / height)
             self._cameras.move(client, place, np.asarray(camera.R), fov)
 
     def _choose(self, event: Any, name: str) -> None:
         self.camera.value = name
-        self.go(event.client)
+        self.move_to_camera(event.client)

@@ -57,7 +57,7 @@ def serve(port: int, label: str) -> tuple["viser.ViserServer", str]:
 
 @contextlib.contextmanager
 def _guarded(title: str) -> Iterator[list[Any]]:
-    """Inside, a viser server that starts answers only what `is_own` lets in. Yields what has started so.
+    """Let a viser server that starts inside answer only requests that pass `is_own`. Yields the servers.
 
     title: of the document, which is called after viser.
     """
@@ -88,7 +88,7 @@ def _guarded(title: str) -> Iterator[list[Any]]:
 
 
 def is_own(request: "Request") -> bool:
-    """Whether the page itself asks, or a program of this machine.
+    """Tell if a request comes from the page itself, or from a program of this machine.
 
     Every site that is open in the user's browser may ask 127.0.0.1 for a websocket, also through a name of its own
     that leads there, and could stop the training. The browser names the site in Origin, and the name in Host. The port
@@ -128,7 +128,7 @@ def _free_port(port: int) -> int:
 
 
 def _announce(requested: int, port: int) -> str:
-    """Say where the page is; its address."""
+    """Print and return the address of the page."""
     from tqdm import tqdm  # the site reads the options of parts without it
 
     url = f"http://{HOST}:{port}/"

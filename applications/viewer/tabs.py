@@ -1,4 +1,4 @@
-"""The tab that says what is drawn, and what all tabs are made of."""
+"""The tab View, whose controls choose the picture, and parts that all tabs use."""
 
 import math
 import re
@@ -21,22 +21,22 @@ _OUTLIERS = 0.02  # quantile of the positions at which the crop box begins
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
-Tell = Callable[["viser.ClientHandle", UserError], None]
+Refuse = Callable[["viser.ClientHandle", UserError], None]
 
 
-def serialized(call: Callable[[Any], object], tell: Tell | None = None) -> Callable[[Any], Any]:
-    """A coroutine for a call, because viser runs those one after the other, and plain functions in many threads.
+def serialize(call: Callable[[Any], object], refuse: Refuse | None = None) -> Callable[[Any], Any]:
+    """Make a coroutine of a call: viser runs coroutines one after the other, but plain functions in many threads.
 
-    tell: called with the browser and a UserError of the call.
+    refuse: called with the browser and a UserError of the call.
     """
 
     async def called(event: Any) -> None:
         try:
             call(event)
         except UserError as error:
-            if tell is None:
+            if refuse is None:
                 raise
-            tell(event.client, error)
+            refuse(event.client, error)
 
     return called
 
@@ -67,7 +67,7 @@ class FileName:
         return self.folder / f"{self.field.value}{self._ending}"
 
     def replaced(self) -> str:
-        """What there is to say of a file that is written now, if there is one already."""
+        """Return a remark for a file that is to be written but exists already; "" if it does not exist."""
         return " (replaced)" if self.path().exists() else ""
 
     def names(self) -> tuple[str, ...]:
@@ -105,7 +105,7 @@ class ViewTab:
             "Cleaning", views.CLEANINGS, visible=cleaned, hint="what export.py --clean does"
         )
         self.crop = gui.add_checkbox("Crop box", False, hint="Gaussians outside are not drawn; the model stays whole")
-        low, high = first_box(positions)
+        low, high = find_first_box(positions)
         longest = max(b - a for a, b in zip(low, high, strict=True))
         step = 10.0 ** math.floor(math.log10(max(longest, 1e-6) / 100))
         self.box = [gui.add_vector2(f"{x} from, to", at, step=step) for x, *at in zip("xyz", low, high, strict=True)]
@@ -127,9 +127,9 @@ class ViewTab:
         for handle in drawn:
             handle.on_update(lambda _: (self._grey(), changed()))
         for handle in (self.crop, *self.box):
-            handle.on_update(serialized(lambda _: (self._show_box(), self._grey(), changed())))
+            handle.on_update(serialize(lambda _: (self._show_box(), self._grey(), changed())))
         written.on_click(lambda _: export())
-        self.reset.on_click(serialized(lambda _: self._reset()))
+        self.reset.on_click(serialize(lambda _: self._reset()))
 
     def _grey(self) -> None:
         self.reset.disabled = all(handle.value == value for handle, value in self._first)
@@ -156,7 +156,7 @@ class ViewTab:
         return tuple(zip(*(ends.value for ends in self.box), strict=True))
 
     def read(self) -> Settings:
-        """What the controls say. Numbers out of range count as the nearest that is in it."""
+        """Read the settings from the controls; a number out of range becomes the nearest one in it."""
         box = self.corners() if self.crop.value else None
         return Settings(
             mode=self.mode.value,
@@ -169,7 +169,7 @@ class ViewTab:
         )
 
 
-def first_box(positions: Tensor) -> tuple[Vector, Vector]:
+def find_first_box(positions: Tensor) -> tuple[Vector, Vector]:
     """A box around most positions (N, 3), rounded to thousandths of its size: its lowest and highest corner."""
     some = positions.detach()[:: max(1, len(positions) // 100_000)].double().cpu()
     some = some[some.isfinite().all(1)]

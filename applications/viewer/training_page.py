@@ -46,7 +46,7 @@ class TrainingPage:
         self._wish = None
         if self._page.watchers.any:
             wish = self._page.watchers.next(at.iteration)
-            if wish is not None and self.budget.allows(MOVING if wish.urgent else STILL):
+            if wish is not None and self.budget.allows_frame(MOVING if wish.urgent else STILL):
                 self._wish = wish
         return self._wish is not None or self._requests.any
 
@@ -67,7 +67,7 @@ class TrainingPage:
     def _draw(self, wish: Wish, version: int) -> None:
         began = time.perf_counter()
         self._page.fulfil(wish, version)
-        self.budget.spent(began, time.perf_counter() - began)
+        self.budget.note_frame(began, time.perf_counter() - began)
 
     def _obey(self, at: Iteration) -> None:
         """Do what was asked for, and return when the training is to go on, or with `step.stopping` set."""
@@ -91,7 +91,7 @@ class TrainingPage:
                 self._draw(wish, at.iteration)
 
     def _save(self, at: Iteration) -> None:
-        """Save a checkpoint. A disk that is full is told, and ends nothing."""
+        """Save a checkpoint. A full disk is reported, and does not end the training."""
         try:
             self._run.checkpoints.save(at)
         except UserError as error:
@@ -138,7 +138,7 @@ class TrainingPage:
             self._stay(f"stopped and saved as {saved}" if by_button else "complete")
 
     def close(self) -> None:
-        """Stop to listen."""
+        """Stop listening."""
         self._page.stop()
 
     def _stay(self, how: str) -> None:

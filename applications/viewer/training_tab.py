@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from applications.viewer.tabs import serialized
+from applications.viewer.tabs import serialize
 
 if TYPE_CHECKING:
     import viser
@@ -16,10 +16,11 @@ _NO_CURVE = "There is no curve yet: it needs test views (`--eval`), and two scor
 
 
 class Requests:
-    """What the page's buttons have asked for. asked: called after each request.
+    """Requests of the page's buttons. Every method may be called from any thread.
 
-    any: whether there is something to do. stopped: the training is to end, or without one the page. Every method may be
-    called from any thread.
+    asked: called after each request.
+    any: there is something to do.
+    stopped: the training is to end, or without a training the page.
     """
 
     def __init__(self, asked: Callable[[], None]) -> None:
@@ -68,11 +69,11 @@ class Requests:
         self._set(stopped=True)
 
     def take_step(self) -> bool:
-        """Whether a paused training may take one iteration; if so, that request is fulfilled."""
+        """Tell if a paused training may take one iteration; if so, the request counts as fulfilled."""
         return self._take("_steps")
 
     def take_checkpoint(self) -> bool:
-        """Whether to save a checkpoint; if so, that request is fulfilled."""
+        """Tell if a checkpoint is to be saved; if so, the request counts as fulfilled."""
         return self._take("_checkpoints")
 
     def work(self) -> None:
@@ -88,7 +89,7 @@ class Requests:
         self._set(paused=False, stopped=False, _steps=0, _checkpoints=0)
 
 
-def duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Seconds for people: "34 s", "3 min 20 s", "2 h 5 min"."""
     minutes, rest = divmod(round(seconds), 60)
     hours, part = divmod(minutes, 60)
@@ -120,8 +121,8 @@ class TrainingTab:
             visible=False,
         )
         self._rows = 0
-        self.pause.on_click(serialized(lambda _: self._turn()))
-        step.on_click(serialized(lambda _: (requests.step(), self._label())))
+        self.pause.on_click(serialize(lambda _: self._turn()))
+        step.on_click(serialize(lambda _: (requests.step(), self._label())))
         save.on_click(lambda _: requests.save())
         for end in (stop, self.close):
             end.on_click(lambda _: requests.stop())
@@ -151,7 +152,7 @@ class TrainingTab:
         subset: how many test views these are, None for all.
         """
         self.speed.value = "" if speed is None else f"{speed:.3g}"
-        self.left.value = "" if left is None else duration(left)
+        self.left.value = "" if left is None else format_duration(left)
         self.loss.value = f"{loss:.5f}"
         if len(rows) != self._rows:
             self._rows = len(rows)

@@ -16,19 +16,19 @@ _SIZE = 1e-3  # standard deviation of a point, by the extent of the cameras
 _LOGIT = 6.0  # of its opacity
 
 
-def untrained(options: argparse.Namespace) -> Scene:
-    """The scene of the model options, whose Gaussians are its points. UserError for a scene without points."""
+def load_untrained(options: argparse.Namespace) -> Scene:
+    """Load the scene of the model options, with its points as Gaussians. UserError for a scene without points."""
     scene = Scene(options, GaussianModel(0), shuffle=False, start=False)
     points, offset, enlargement = scene.info.point_cloud, scene.gaussians.world_offset, scene.gaussians.enlargement
     if not len(points.points):
         raise UserError(f"{options.source_path} has no points to show; train it first, and give its model with -m")
-    scene.gaussians = model_of(_spheres(points.points, points.colors, _SIZE * scene.cameras_extent))
+    scene.gaussians = model_of(_make_spheres(points.points, points.colors, _SIZE * scene.cameras_extent))
     scene.gaussians.world_offset, scene.gaussians.enlargement = offset, enlargement
     scene.model_path = options.source_path  # the name of the page, and where it writes paths and crops
     return scene
 
 
-def _spheres(points: np.ndarray, colors: np.ndarray, size: float) -> Splats:
+def _make_spheres(points: np.ndarray, colors: np.ndarray, size: float) -> Splats:
     """Nearly opaque Gaussians at points (N, 3) with colors (N, 3) in [0, 1] and a standard deviation, all alike."""
     count = len(points)
     sh = RGB2SH(torch.from_numpy(np.asarray(colors, np.float32)))[:, None].numpy()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gaussian_renderer.camera_paths.poses import facing, focus_point, opening, poses_of, unit
+from gaussian_renderer.camera_paths.poses import focus_point, look_along, poses_of, unit, vertical_fov
 from gaussian_renderer.camera_paths.start import best_start
 from gaussian_renderer.free_view import rotation_matrix
 from groundwork.host.listing import as_utf8
@@ -69,16 +69,16 @@ class Settings:
     slider: float = 0.5
 
 
-def pose_of(camera: "viser.CameraHandle") -> Pose | None:
+def read_pose(camera: "viser.CameraHandle") -> Pose | None:
     """The pose and window of a browser's camera, whose numbers are finite (auth.py); None if it cannot be drawn."""
     position, wxyz = [float(x) for x in camera.position], [float(x) for x in camera.wxyz]
     fov, length = float(camera.fov), math.hypot(*wxyz)
     if not 0 < fov < math.pi or not 1e-6 < length < 1e6:
         return None
-    return Pose(tuple(position), tuple(x / length for x in wxyz), fov, *window_of(camera))
+    return Pose(tuple(position), tuple(x / length for x in wxyz), fov, *read_window(camera))
 
 
-def window_of(camera: "viser.CameraHandle") -> tuple[int, int]:
+def read_window(camera: "viser.CameraHandle") -> tuple[int, int]:
     """Width and height, in pixels, of a browser's window; sides that cannot be drawn count as the nearest that can."""
     width, height = (min(max(int(side), 1), _WIDEST) for side in (camera.image_width, camera.image_height))
     return max(width, height // _SLIMMEST), max(height, width // _SLIMMEST)
@@ -142,7 +142,7 @@ class SceneCameras:
             ahead = axis - (axis @ self.up) * self.up
             if np.linalg.norm(ahead) > 1e-3:
                 break
-        axes = facing(math.cos(_ABOVE) * unit(ahead) - math.sin(_ABOVE) * self.up, self.up)
+        axes = look_along(math.cos(_ABOVE) * unit(ahead) - math.sin(_ABOVE) * self.up, self.up)
         inner = np.vstack([self._places] + ([] if self._target is None else [self._target])) @ axes
         middle = (inner.min(0) + inner.max(0)) / 2
         slope = _FILLED * math.tan(_OF_ALL / 2)
@@ -151,27 +151,27 @@ class SceneCameras:
         return target - max(float(away), self.size) * axes[:, 2], axes, target
 
     def stands_at(self, pose: Pose, place: np.ndarray, axes: np.ndarray) -> bool:
-        """Whether a page's camera has a place and a direction."""
+        """Tell if a page's camera stands at a place and looks in a direction."""
         apart = np.linalg.norm(np.asarray(pose.position) - place)
         cosine = (np.trace(rotation_matrix(pose.wxyz).T @ axes) - 1) / 2
         return bool(apart <= _NEAR * self.size and math.acos(float(np.clip(cosine, -1, 1))) <= _TURNED)
 
     def stands_at_camera(self, pose: Pose, camera: Camera) -> bool:
-        """Whether a page's camera has the place and the direction of a scene's camera."""
+        """Tell if a page's camera has the place and the direction of a scene's camera."""
         return self.stands_at(pose, camera_center(camera.R, camera.T), np.asarray(camera.R))
 
 
-def canvas(width: int, height: int, aspect: float) -> tuple[int, int]:
+def fit_canvas(width: int, height: int, aspect: float) -> tuple[int, int]:
     """The smallest (width, height) of an aspect in which an image fits."""
     if width < aspect * height:
         return max(width, round(height * aspect)), height
     return width, max(height, round(width / aspect))
 
 
-def fov_of_canvas(camera: Camera, aspect: float) -> float:
+def fit_fov(camera: Camera, aspect: float) -> float:
     """Vertical opening angle, radians, of a window of this aspect that shows all of a camera's image."""
-    _, height = canvas(camera.image_width, camera.image_height, aspect)
-    return 2 * math.atan(math.tan(opening(camera) / 2) * height / camera.image_height)
+    _, height = fit_canvas(camera.image_width, camera.image_height, aspect)
+    return 2 * math.atan(math.tan(vertical_fov(camera) / 2) * height / camera.image_height)
 
 
 def overview_fov(aspect: float) -> float:

@@ -1,4 +1,4 @@
-"""When to draw: the browsers that watch, the next frame of them, and a training's share of time for frames."""
+"""Order of drawing: the browsers that watch, the next frame for one of them, and a training's share of time for it."""
 
 import threading
 import time
@@ -25,11 +25,11 @@ class Budget:
         self._began = -float("inf")
         self._cost = 0.0
 
-    def allows(self, share: float) -> bool:
-        """Whether a frame may begin now, if all of them may take `share` of the time."""
+    def allows_frame(self, share: float) -> bool:
+        """Tell if a frame may begin now, where all frames may take `share` of the time."""
         return self._clock() - self._began >= max(self._cost / share, _BETWEEN)
 
-    def spent(self, began: float, seconds: float) -> None:
+    def note_frame(self, began: float, seconds: float) -> None:
         """Note a frame that began at `began` and took `seconds`."""
         self._began, self._cost = began, seconds
 
@@ -65,8 +65,8 @@ class Watchers:
         self._watchers: dict[int, Watcher] = {}
         self.any = False  # read without a lock, in every iteration of a training
 
-    def moved(self, client: int, pose: Pose) -> None:
-        """A browser has come, or its camera has moved, or its window has another size."""
+    def update_browser(self, client: int, pose: Pose) -> None:
+        """Note that a browser has come, that its camera has moved, or that its window has another size."""
         now = self._clock()
         with self._changed:
             known = self._watchers.get(client)
@@ -78,15 +78,15 @@ class Watchers:
             self.any = True
             self._changed.notify_all()
 
-    def left(self, client: int) -> None:
-        """A browser has gone."""
+    def remove_browser(self, client: int) -> None:
+        """Forget a browser that has gone."""
         with self._changed:
             self._watchers.pop(client, None)
             self.any = bool(self._watchers)
             self._changed.notify_all()
 
-    def changed(self, dragging: bool = False) -> None:
-        """What is shown has changed for all. dragging: by a slider, which may go on moving."""
+    def note_change(self, dragging: bool = False) -> None:
+        """Note that the picture has changed for all browsers. dragging: by a slider, which may go on moving."""
         now = self._clock()
         with self._changed:
             for watcher in self._watchers.values():
@@ -123,8 +123,8 @@ class Watchers:
             return Wish(client, watcher.pose, moving, urgent)
         return None
 
-    def drew(self, wish: Wish, version: int = 0) -> None:
-        """A wish's frame is about to be drawn: changes from now on ask for another one."""
+    def note_drawing(self, wish: Wish, version: int = 0) -> None:
+        """Note that a wish's frame is about to be drawn: changes from now on ask for another one."""
         with self._changed:
             watcher = self._watchers.get(wish.client)
             if watcher is not None:

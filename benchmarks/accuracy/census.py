@@ -24,9 +24,9 @@ import torch
 from diff_gaussian_rasterization import Gaussians
 from tqdm import tqdm
 
-from benchmarks.accuracy.splat_shapes import Histogram, Sorted, Splats, axes_of, cells, seen
-from benchmarks.accuracy.trained_models import TrainedModel, model_parser, trained
-from benchmarks.harness.measuring import chosen_device, describe, print_table
+from benchmarks.accuracy.splat_shapes import Histogram, Sorted, Splats, count_cells, measure_splats, sort_axes
+from benchmarks.accuracy.trained_models import TrainedModel, load_trained, model_parser
+from benchmarks.harness.measuring import choose_device, describe_machine, print_table
 from splatting.records.figures import save_figure
 from tests.workloads.stability_cases import CASES, Case
 from utils.system_utils import UserError, run_cli
@@ -40,7 +40,7 @@ AXES = {
     "depth": "distance",
 }
 LEAST = 1e-4  # share of a model's splats; cells with fewer are not listed
-CLASSES = ("below 1/255", "1/255 to 0.1", "0.1 to 0.99", "0.99 and more")  # of opacities, as in `cells`
+CLASSES = ("below 1/255", "1/255 to 0.1", "0.1 to 0.99", "0.99 and more")  # of opacities, as in `count_cells`
 MOST_CELLS = 8  # of a model
 LARGEST = 1e9  # drawn of a case
 
@@ -63,14 +63,14 @@ def census(model: TrainedModel) -> Census:
     longest = torch.zeros(model.count, dtype=torch.float64, device=device)
     condition, depth = Histogram(device), Histogram(device)
     for camera in tqdm(model.cameras, desc=model.label, unit="view", leave=False):
-        for splats in seen(model.gaussians, camera):
+        for splats in measure_splats(model.gaussians, camera):
             condition.add(splats.condition)
             depth.add(splats.depth)
-            counts += cells(splats)
+            counts += count_cells(splats)
             longest[splats.row] = torch.maximum(longest[splats.row], splats.length)
     if not counts:
         raise UserError(f"no view shows a Gaussian of {model.label}; is this the model of these cameras?")
-    axes = axes_of(model.gaussians._replace(scales=model.gaussians.scales.double().exp()))
+    axes = sort_axes(model.gaussians._replace(scales=model.gaussians.scales.double().exp()))
     by_axis = {
         "ratio": Sorted((axes[:, 0] / axes[:, 2]).nan_to_num(1.0, posinf=math.inf)),
         "length": Sorted(longest[longest > 0]),
@@ -81,12 +81,12 @@ def census(model: TrainedModel) -> Census:
     return Census(model.label, by_axis, counts)
 
 
-def case_splats(case: Case) -> tuple[Splats, Splats] | None:
+def measure_case(case: Case) -> tuple[Splats, Splats] | None:
     """All splats of a case, and the stiff ones; None where nothing finite is shown."""
     problem = case.problem()
     present, raw = ~problem.absent, problem.raw
     gaussians = Gaussians(**{name: values[present] for name, values in problem.parameters.items()})
-    parts = list(seen(gaussians, problem.camera, raw))
+    parts = list(measure_splats(gaussians, problem.camera, raw))
     if not parts or not len(parts[0].row):
         return None
     (shown,) = parts
@@ -94,7 +94,7 @@ def case_splats(case: Case) -> tuple[Splats, Splats] | None:
     return shown, Splats(*(values[stiff] for values in shown))
 
 
-def extremes(stiff: Splats) -> dict[str, float]:
+def find_extremes(stiff: Splats) -> dict[str, float]:
     """The most extreme numbers of splats: the nearest distance, and the largest of the others."""
     return {axis: float(getattr(stiff, axis).min() if axis == "depth" else getattr(stiff, axis).max()) for axis in AXES}
 
@@ -106,14 +106,14 @@ def case_rows(censuses: list[Census], by_case: dict[Case, tuple[Splats, Splats]]
         if not len(stiff.row):
             continue
         row = [case.name]
-        for axis, value in extremes(stiff).items():
+        for axis, value in find_extremes(stiff).items():
             beyond = max(found.axes[axis].beyond(value, below=axis == "depth") for found in censuses)
             row.append(f"{_short(value)} ({_percent(beyond)})")
         rows.append(row)
     return rows
 
 
-def projected(counts: Counter, pair: tuple[int, int]) -> Counter:
+def project_counts(counts: Counter, pair: tuple[int, int]) -> Counter:
     """Counts by the classes of two axes."""
     found = Counter()
     for cell, count in counts.items():
@@ -121,12 +121,12 @@ def projected(counts: Counter, pair: tuple[int, int]) -> Counter:
     return found
 
 
-def uncovered(found: Census, covered: Iterable[tuple[int, ...]]) -> list[tuple[float, str, str]]:
+def find_uncovered(found: Census, covered: Iterable[tuple[int, ...]]) -> list[tuple[float, str, str]]:
     """Share of a model's splats in each cell of two axes that no case covers, most first, with the cell in words."""
     covered, gaps, names = Counter(covered), [], list(AXES)
     for pair in combinations(range(len(AXES)), 2):
-        known = projected(covered, pair)
-        for cell, count in projected(found.cells, pair).items():
+        known = project_counts(covered, pair)
+        for cell, count in project_counts(found.cells, pair).items():
             if cell not in known:
                 words = [f"{AXES[names[axis]]} {_class(names[axis], of)}" for axis, of in zip(pair, cell, strict=True)]
                 gaps.append((count / found.splats, *words))
@@ -156,12 +156,12 @@ def print_report(censuses: list[Census], by_case: dict[Case, tuple[Splats, Splat
     print_table(header, rows)
     print("\nCases: extremes of stiff Gaussians, and percent of a model beyond them\n")
     print_table(["case", *AXES.values()], case_rows(censuses, by_case))
-    covered = [cell for shown, _ in by_case.values() for cell in cells(shown)]
+    covered = [cell for shown, _ in by_case.values() for cell in count_cells(shown)]
     print("\nSplats where no case has any\n")
     rows = [
         [found.label, first, second, f"{100 * share:.2g} %"]
         for found in censuses
-        for share, first, second in uncovered(found, covered)[:MOST_CELLS]
+        for share, first, second in find_uncovered(found, covered)[:MOST_CELLS]
         if share >= LEAST
     ]
     print_table(["model", "one axis", "the other", "splats"], rows)
@@ -173,7 +173,7 @@ def draw(path: Path, censuses: list[Census], by_case: dict[Case, tuple[Splats, S
 
     figure = Figure(figsize=(14, 7.5), layout="constrained")
     panels = figure.subplots(2, 3).ravel()
-    stiffest = [extremes(stiff) for _, stiff in by_case.values() if len(stiff.row)]
+    stiffest = [find_extremes(stiff) for _, stiff in by_case.values() if len(stiff.row)]
     for panel, (axis, name) in zip(panels, AXES.items(), strict=False):
         for found in censuses:
             panel.plot(*found.axes[axis].curve(), label=found.label, linewidth=1.5)
@@ -192,14 +192,14 @@ def draw(path: Path, censuses: list[Census], by_case: dict[Case, tuple[Splats, S
 @torch.no_grad()
 def main() -> None:
     args = model_parser(__doc__).parse_args()
-    device = chosen_device(args)
+    device = choose_device(args)
     censuses = []
     for word in args.models:
-        model = trained(word, device)
+        model = load_trained(word, device)
         censuses.append(census(model))
         print(f"{model.label}: {model.count} Gaussians, {len(model.cameras)} {'made ' if model.made else ''}views")
-    print(describe(device) + "\n")
-    by_case = {case: splats for case in CASES if (splats := case_splats(case))}
+    print(describe_machine(device) + "\n")
+    by_case = {case: splats for case in CASES if (splats := measure_case(case))}
     print_report(censuses, by_case)
     if args.figure:
         draw(args.figure, censuses, by_case)

@@ -1,4 +1,4 @@
-"""Which trainings give equal bytes on which machines: the SHA-256 of five small models, as a line of JSON.
+"""Hashes of trainings, to find machines that give equal bytes: the SHA-256 of five small models, a line of JSON.
 
     python -m benchmarks.accuracy.hashes --scene SCENE > MACHINE.jsonl
     python -m benchmarks.accuracy.hashes --scene SCENE --compare MACHINE.jsonl OTHER.jsonl > THIS.jsonl
@@ -22,7 +22,7 @@ from typing import Any
 
 from applications.demo.make_scene import make_scene
 from applications.evaluation.child import run_child
-from benchmarks.harness.measuring import add_device, chosen_device
+from benchmarks.harness.measuring import add_device, choose_device
 from groundwork.host.listing import markdown_table
 from groundwork.host.machine import facts
 from splatting.records.model_folder import trained_iterations
@@ -41,12 +41,12 @@ TRAININGS = {
 }
 
 
-def digest_of(paths: Iterable[Path]) -> str:
+def hash_files(paths: Iterable[Path]) -> str:
     """The SHA-256 of the files' bytes, in the order of their paths."""
     return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(paths))).hexdigest()
 
 
-def trained(scene: Path, model: Path, options: str, device: str) -> str:
+def train_and_hash(scene: Path, model: Path, options: str, device: str) -> str:
     """Train a model in a process of its own; the SHA-256 of its last PLY."""
     words = ["-s", str(scene), "-m", str(model), *shlex.split(_SHORT), *shlex.split(options)]
     hidden = {"CUDA_VISIBLE_DEVICES": ""} if device == "cpu" else {}
@@ -58,7 +58,7 @@ def trained(scene: Path, model: Path, options: str, device: str) -> str:
     return digest
 
 
-def measured(device: str, scene: Path | None) -> dict[str, Any]:
+def measure_machine(device: str, scene: Path | None) -> dict[str, Any]:
     """The facts of this machine, torch's instruction set, and SHA-256 by name. scene: made if it is missing or None."""
     import torch
 
@@ -66,13 +66,16 @@ def measured(device: str, scene: Path | None) -> dict[str, Any]:
         scene = scene or Path(folder) / "scene"
         if not scene.is_dir():
             make_scene(scene, *_SCENE)
-        found = {"photos": digest_of((scene / "images").iterdir()), "points": digest_of((scene / "sparse/0").iterdir())}
+        found = {
+            "photos": hash_files((scene / "images").iterdir()),
+            "points": hash_files((scene / "sparse/0").iterdir()),
+        }
         for name, options in TRAININGS.items():
-            found[name] = trained(scene, Path(folder) / name, options, device)
+            found[name] = train_and_hash(scene, Path(folder) / name, options, device)
     return facts(device) | {"torch_set": torch.backends.cpu.get_cpu_capability().lower(), "sha256": found}
 
 
-def table(records: Sequence[dict[str, Any]]) -> str:
+def make_table(records: Sequence[dict[str, Any]]) -> str:
     """A Markdown table with a row for each record; equal letters in a column are equal bytes."""
     columns = [[record["gpu"] or record["cpu"] for record in records]]
     columns.append(["CUDA" if record["gpu"] else record["instruction_set"] for record in records])
@@ -95,13 +98,13 @@ def main() -> None:
     args = parser.parse_args()
     try:
         others = [json.loads(line) for path in args.compare for line in path.read_text(encoding="utf-8").splitlines()]
-        table(others)  # which reads all that it needs
+        make_table(others)  # which reads all that it needs
     except (OSError, ValueError, LookupError, TypeError) as error:
         raise UserError(f"--compare found a line that is not of this command: {error!r}") from error
-    found = measured(chosen_device(args), args.scene)
+    found = measure_machine(choose_device(args), args.scene)
     print(json.dumps(found, sort_keys=True), flush=True)
     if others:
-        print(table([*others, found]), file=sys.stderr)
+        print(make_table([*others, found]), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ from diff_gaussian_rasterization.lens import Lens, lens_of
 from diff_gaussian_rasterization.scene import scene_arguments
 from torch import Tensor
 
-from benchmarks.harness.measuring import add_device, chosen_device, describe, print_table
+from benchmarks.harness.measuring import add_device, choose_device, describe_machine, print_table
 from utils.system_utils import run_cli
 
 _WIDTH, _HEIGHT, _COUNT, _EXACT, _DEGREE = 640, 480, 2000, 200, math.pi / 180
@@ -48,7 +48,7 @@ _ANGLES = {"equidistant": (0, 10, 60, 90, 120, 170), "perspective": (0, 10, 30, 
 _SHAPES = ((0.2, 0.2, 0.2), (1.0, 1.0, 1.0), (5.0, 5.0, 5.0), (5.0, 0.2, 0.2))  # degrees
 
 
-def camera(
+def make_camera(
     lens: Lens, dtype: torch.dtype, device: str, width: int = _WIDTH, height: int = _HEIGHT, projection: str = "ewa"
 ) -> GaussianRasterizationSettings:
     """Settings of a camera at the origin."""
@@ -59,16 +59,16 @@ def camera(
     return plain._replace(projection=projection)
 
 
-def field_of(lens: Lens) -> float:
+def half_field(lens: Lens) -> float:
     """Half the angle that a lens shows, radians."""
     field = lens.field(_WIDTH, _HEIGHT)
     return math.atan(field) if lens.chart == "perspective" else min(field, math.pi - 0.1)
 
 
-def spread(lens: Lens) -> dict[str, Tensor]:
+def make_spread(lens: Lens) -> dict[str, Tensor]:
     """Gaussians all over a lens's field, float32 values as float64."""
     rng, draw = np.random.default_rng(0), torch.Generator().manual_seed(0)
-    theta = field_of(lens) * np.sqrt(rng.uniform(0, 1, _COUNT))
+    theta = half_field(lens) * np.sqrt(rng.uniform(0, 1, _COUNT))
     phi, away = rng.uniform(0, 2 * math.pi, _COUNT), rng.uniform(1, 5, (_COUNT, 1))
     ray = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], 1)
     shapes = {"opacities": (1,), "scales": (3,), "rotations": (4,), "sh_dc": (1, 3), "sh_rest": (15, 3)}
@@ -78,11 +78,11 @@ def spread(lens: Lens) -> dict[str, Tensor]:
     return {name: values.float().double() for name, values in drawn.items()}
 
 
-def drawn(
+def draw_splats(
     lens: Lens, values: dict[str, Tensor], dtype: torch.dtype, device: str, projection: str = "ewa"
 ) -> tuple[Tensor, Tensor, list[Tensor]]:
     """The means' pixels where they are shown, else NaN, the image, and the gradients."""
-    settings = camera(lens, dtype, device, projection=projection)
+    settings = make_camera(lens, dtype, device, projection=projection)
     leaves = {name: value.to(device, dtype).clone().requires_grad_() for name, value in values.items()}
     splats, _, _, counts, *_ = OPERATORS.project(*scene_arguments(Gaussians(**leaves), settings, True))
     pixels = torch.where(counts[:, None] > 0, splats[:, :2], math.nan)
@@ -96,22 +96,22 @@ def drawn(
 
 def exact_row(name: str, lens: Lens) -> list[str]:
     """A row of the first table."""
-    means = spread(lens)["means"]
-    row = [name, f"{2 * field_of(lens) / _DEGREE:.0f}", *(f"{e:.1e}" for e in mpmath_errors(lens, means[:_EXACT]))]
+    means = make_spread(lens)["means"]
+    row = [name, f"{2 * half_field(lens) / _DEGREE:.0f}", *(f"{e:.1e}" for e in mpmath_errors(lens, means[:_EXACT]))]
     if name not in _EXTRAS:
         return [*row, "", ""]
     shown = pycolmap.Camera(model=name, width=_WIDTH, height=_HEIGHT, params=_params(name))
     theirs = torch.from_numpy(np.asarray(shown.img_from_cam(means.numpy()))) - 0.5
-    pixels = (drawn(lens, spread(lens), torch.float64, "cpu")[0] - theirs).abs().nan_to_num(0).max()
+    pixels = (draw_splats(lens, make_spread(lens), torch.float64, "cpu")[0] - theirs).abs().nan_to_num(0).max()
     return [*row, f"{pixels:.1e}", f"{slopes_error(shown, lens, means.numpy()):.1e}"]
 
 
 def single_row(name: str, lens: Lens, device: str) -> list[str]:
     """A row of the second table."""
-    row, values = [name], spread(lens)
+    row, values = [name], make_spread(lens)
     for projection in ("ewa", "ray"):
         exact, single = (
-            drawn(lens, values, *at, projection) for at in ((torch.float64, "cpu"), (torch.float32, device))
+            draw_splats(lens, values, *at, projection) for at in ((torch.float64, "cpu"), (torch.float32, device))
         )
         pixels, image = ((single[k] - exact[k]).abs().nan_to_num(0).max() for k in range(2))
         gradients = max((a - b).abs().max() / b.abs().max() for a, b in zip(single[2], exact[2], strict=True))
@@ -120,7 +120,10 @@ def single_row(name: str, lens: Lens, device: str) -> list[str]:
 
 
 def exact_pixel(lens: Lens, point: list) -> list:
-    """Where a lens shows a point of the view, in mpmath's numbers: COLMAP's formulas (Brown 1966, Weng et al. 1992)."""
+    """Return the pixel at which a lens shows a point of the view, by COLMAP's formulas in mpmath's numbers.
+
+    The formulas are those of Brown 1966 and Weng et al. 1992.
+    """
     x, y, z = point
     r = mpmath.sqrt(x * x + y * y)
     if lens.chart == "perspective":
@@ -172,7 +175,7 @@ def mpmath_errors(lens: Lens, means: Tensor) -> tuple[float, float, float]:
         values |= {"rotations": torch.eye(4)[:1].repeat(count, 1), "sh_dc": torch.zeros(count, 1, 3)}
         values |= {"sh_rest": torch.zeros(count, 15, 3)}
         scene = scene_arguments(
-            Gaussians(**{k: v.double() for k, v in values.items()}), camera(lens, torch.float64, "cpu"), True
+            Gaussians(**{k: v.double() for k, v in values.items()}), make_camera(lens, torch.float64, "cpu"), True
         )
         splats, _, _, tiles, _ = OPERATORS.project(*scene)
         splats[tiles == 0] = 1  # undefined
@@ -219,7 +222,7 @@ def slopes_error(shown: pycolmap.Camera, lens: Lens, means: np.ndarray) -> float
     balls = {"means": means, "scales": np.log(size).repeat(3, 1), "rotations": np.eye(4)[:1].repeat(count, 0)}
     balls |= {"opacities": np.zeros((count, 1)), "sh_dc": np.zeros((count, 1, 3)), "sh_rest": np.zeros((count, 15, 3))}
     scene = Gaussians(**{name: torch.from_numpy(values) for name, values in balls.items()})
-    splats, _, _, counts, *_ = OPERATORS.project(*scene_arguments(scene, camera(lens, torch.float64, "cpu"), True))
+    splats, _, _, counts, *_ = OPERATORS.project(*scene_arguments(scene, make_camera(lens, torch.float64, "cpu"), True))
     x, y, a, b, c = splats[:, :5].numpy().T
     factor = np.stack([np.stack([a, b], 1), np.stack([0 * c, c], 1)], 1)
     inside = (x >= 0) & (x < _WIDTH) & (y >= 0) & (y < _HEIGHT) & (means[:, 2] > 0) & (counts.numpy() > 0)
@@ -259,7 +262,7 @@ def projection_errors(chart: str, angle: float, deviations: tuple[float, float, 
     exact = np.nan_to_num(0.9 * np.exp(-0.5 * square) * (toward @ origin < 0))
     exact[exact < 1 / 255] = 0
     known = torch.from_numpy(np.isfinite(square))
-    settings = camera(lens, torch.float64, "cpu", pixels, pixels)
+    settings = make_camera(lens, torch.float64, "cpu", pixels, pixels)
     upper = torch.from_numpy((axes * sizes**2 @ axes.T)[np.triu_indices(3)])[None]
     mean, opacity = torch.from_numpy(ray)[None], torch.full((1, 1), 0.9, dtype=torch.float64)
     shape = {"cov3d": upper, "colors": torch.ones(1, 3, dtype=torch.float64)}
@@ -274,8 +277,8 @@ def projection_errors(chart: str, angle: float, deviations: tuple[float, float, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add_device(parser)
-    device = chosen_device(parser.parse_args())
-    print(describe(device))
+    device = choose_device(parser.parse_args())
+    print(describe_machine(device))
     lenses = {name: lens_of(name, tuple(_params(name))) for name in _EXTRAS} | {"panorama": _PANORAMA}
     header = ["lens", "degrees", "mpmath: pixels", "first", "second", "pycolmap: pixels", "slopes"]
     print_table(header, [exact_row(name, lens) for name, lens in lenses.items()])

@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT, ORACLE, Backend, kernels, run
 from benchmarks.harness.calls import Calls
-from benchmarks.harness.measuring import cpu_milliseconds, describe, gpu_milliseconds, print_table
+from benchmarks.harness.measuring import cpu_milliseconds, describe_machine, gpu_milliseconds, print_table
 from tests.workloads.splat_scenes import KINDS
 from tests.workloads.stability_cases import Problem, all_stiff
 from utils.system_utils import run_cli
@@ -129,7 +129,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--times", action="store_true", help="also time the kernels")
     args = parser.parse_args()
-    print("\n".join(dict.fromkeys(describe(kernel.device) for kernel in kernels())))
+    print("\n".join(dict.fromkeys(describe_machine(kernel.device) for kernel in kernels())))
     records, runs = measure(args.times)
     print_errors(records)
     if CUDA_FLOAT in kernels():

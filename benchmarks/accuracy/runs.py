@@ -8,7 +8,7 @@ from diff_gaussian_rasterization import rasterize, reference
 from torch import Tensor
 
 from tests.workloads import textbook
-from tests.workloads.splat_scenes import on_device
+from tests.workloads.splat_scenes import move_camera
 from tests.workloads.stability_cases import Problem
 from utils.system_utils import compute_device
 
@@ -46,7 +46,7 @@ def run(problem: Problem, backend: Backend, rows: Tensor | None = None, keep: Te
     device = backend.device
     chosen = {k: t if rows is None else t[rows] for k, t in problem.parameters.items()}
     leaves = {k: t.to(device, backend.dtype, copy=True).requires_grad_() for k, t in chosen.items()}
-    camera = on_device(problem.camera, device)
+    camera = move_camera(problem.camera, device)
     means2d = torch.zeros_like(leaves["means"], requires_grad=True)
     named = {k: t for k, t in leaves.items() if k not in ("means", "opacities")}
     if backend.render is rasterize:

@@ -1,4 +1,4 @@
-"""How stiff Gaussians are, as cameras see them: five numbers each, and how these are distributed.
+"""Stiffness of Gaussians, as cameras see them: five numbers for each, and the distribution of these numbers.
 
 A splat is a Gaussian in a view: in front of the camera, and with a square of three deviations that touches the image.
 All numbers come from the formulas of the float64 oracle, in float64, on the device of the Gaussians.
@@ -33,7 +33,7 @@ class Splats(NamedTuple):
     depth: Tensor  # world units in front of the camera
 
 
-def axes_of(gaussians: Gaussians) -> Tensor:
+def sort_axes(gaussians: Gaussians) -> Tensor:
     """Standard deviations (N, 3) of activated Gaussians along their axes, longest first."""
     if gaussians.cov3d is None:
         return gaussians.scales.sort(1, descending=True).values
@@ -41,15 +41,15 @@ def axes_of(gaussians: Gaussians) -> Tensor:
     return torch.linalg.eigvalsh(square).clamp(min=0).sqrt().flip(1)
 
 
-def seen(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool = True) -> Iterator[Splats]:
+def measure_splats(gaussians: Gaussians, settings: GaussianRasterizationSettings, raw: bool = True) -> Iterator[Splats]:
     """The splats of a view, chunk by chunk. Gaussians that are not finite are left out."""
     for start in range(0, len(gaussians.means), ROWS):
         part = Gaussians(*(None if values is None else values[start : start + ROWS].double() for values in gaussians))
-        found = _seen_at_once(part, settings, raw)
+        found = _measure_chunk(part, settings, raw)
         yield found._replace(row=found.row + start)
 
 
-def _seen_at_once(part: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> Splats:
+def _measure_chunk(part: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> Splats:
     with torch.device(part.means.device):  # where the oracle makes its constants
         camera = camera_of(settings)
         part = activated(part) if raw else part
@@ -59,7 +59,7 @@ def _seen_at_once(part: Gaussians, settings: GaussianRasterizationSettings, raw:
     xx, xy, yy = ellipses.covariance()
     determinant = (ellipses.r11 * ellipses.r22).square()
     largest = (xx + yy) / 2 + torch.sqrt(((xx - yy) / 2).square() + xy * xy)
-    axes, opacity = axes_of(part), part.opacities.reshape(-1)
+    axes, opacity = sort_axes(part), part.opacities.reshape(-1)
     values = [axes[:, 0] / axes[:, 2], largest.sqrt(), largest.square() / determinant, opacity, points.depth]
     shown &= torch.stack([largest, opacity, points.depth, axes[:, 0]]).isfinite().all(0)
     row = shown.nonzero()[:, 0]
@@ -126,11 +126,11 @@ class Sorted:
         return self.values[kept].tolist(), (1 - (kept + 1).double() / count).tolist()
 
 
-def cells(splats: Splats) -> Counter[tuple[int, ...]]:
-    """How many splats have these classes of ratio, length, condition, opacity and depth.
+def count_cells(splats: Splats) -> Counter[tuple[int, ...]]:
+    """Count the splats by their classes of ratio, length, condition, opacity and depth.
 
-    A class is the decade of the number, so 2 for 100 to 1,000; of opacities it is 0 below 1/255, 1 below 0.1, 2 below
-    0.99, else 3.
+    The class of a number is its decade, so 2 for 100 to 1,000; that of an opacity is 0 below 1/255, 1 below 0.1, 2
+    below 0.99, else 3.
     """
     code = torch.zeros_like(splats.row)
     for name in Splats._fields[1:]:

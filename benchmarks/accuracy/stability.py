@@ -27,7 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CUDA_FLOAT, ORACLE, TEXTBOOK, Backend, kernels, run
-from benchmarks.harness.measuring import cpu_milliseconds, describe, print_table
+from benchmarks.harness.measuring import cpu_milliseconds, describe_machine, print_table
 from tests.workloads.stability_cases import CASES, PLAIN, Case, Problem
 from utils.system_utils import run_cli
 
@@ -59,7 +59,7 @@ class Judged:
         present = ~p.absent
         planes, gradients, self.keep = run(p, ORACLE, rows=present, cut=case.cut)
         self.planes = planes
-        self.gradients = {name: _spread(g, present) for name, g in gradients.items()}
+        self.gradients = {name: _mask_rows(g, present) for name, g in gradients.items()}
         stiff, alone = p.stiff & present, torch.ones(1)
         if torch.equal(stiff, present):
             alone = planes["transmittance"]
@@ -75,8 +75,8 @@ class Judged:
     def one_rounding(self) -> Result:
         """Return the errors of the oracle when its inputs are off by one float32 rounding."""
         present = ~self.problem.absent
-        planes, gradients, _ = run(_nudged(self.problem), ORACLE, rows=present, keep=self.keep)
-        return self._compare(planes, {name: _spread(g, present) for name, g in gradients.items()})
+        planes, gradients, _ = run(_nudge(self.problem), ORACLE, rows=present, keep=self.keep)
+        return self._compare(planes, {name: _mask_rows(g, present) for name, g in gradients.items()})
 
     def _compare(self, planes: dict[str, Tensor], gradients: dict[str, Tensor]) -> Result:
         finite = all(t.isfinite().all() for t in [*planes.values(), *gradients.values()])
@@ -99,8 +99,8 @@ class Judged:
         return cpu_milliseconds(lambda: run(self.problem, backend, keep=self.keep), repeats=3)
 
 
-def beyond(case: Case, backend: Backend, judged: Judged, result: Result) -> list[str]:
-    """Return what of our result of a case is not finite, or above the case's bounds; nothing if it is as it should."""
+def find_excess(case: Case, backend: Backend, judged: Judged, result: Result) -> list[str]:
+    """Return the parts of our result of a case that are not finite or above the case's bounds; empty if none are."""
     found = [] if result.finite else [f"{case.name}: NaN or Inf"]
     # If all Gaussians are stiff, the pixels that none reaches are next to pixels that one does.
     ordinary = case.bound.image if judged.problem.stiff.all() else PLAIN.image
@@ -114,7 +114,7 @@ def beyond(case: Case, backend: Backend, judged: Judged, result: Result) -> list
     return found
 
 
-def _nudged(problem: Problem) -> Problem:
+def _nudge(problem: Problem) -> Problem:
     """Change each parameter by 2^-24 of itself, up or down at random, and round the camera to float32."""
     g = torch.Generator().manual_seed(3)
     parameters = {
@@ -126,7 +126,7 @@ def _nudged(problem: Problem) -> Problem:
     return replace(problem, parameters=parameters, camera=camera._replace(**rounded))
 
 
-def _spread(rows: Tensor, where: Tensor) -> Tensor:
+def _mask_rows(rows: Tensor, where: Tensor) -> Tensor:
     out = rows.new_zeros((len(where), *rows.shape[1:]))
     out[where] = rows
     return out
@@ -141,7 +141,7 @@ def _error(got: Tensor, expected: Tensor, where: Tensor) -> float:
     return float(difference.max()) / ((whole if scale < 1e-9 * whole else scale) or 1.0)
 
 
-def _digits(value: float) -> str:
+def _format_digits(value: float) -> str:
     return "-" if math.isnan(value) else f"{value:.0e}"
 
 
@@ -153,9 +153,11 @@ def print_report(results: dict[str, dict[str, Result]]) -> None:
         for case, result in results[backend].items():
             cells = []
             for kind in ("planes", "gradients"):
-                cells.append(_digits(result.worst(kind, "ordinary")))
+                cells.append(_format_digits(result.worst(kind, "ordinary")))
                 others = [results[name][case].worst(kind, "stiff") for name in (ROUNDING, TEXTBOOK.name)]
-                cells.append(_digits(result.worst(kind, "stiff")) + " ({} / {})".format(*map(_digits, others)))
+                cells.append(
+                    _format_digits(result.worst(kind, "stiff")) + " ({} / {})".format(*map(_format_digits, others))
+                )
             rows.append([case, "yes" if result.finite else "NO", *cells])
         print_table(["case", "finite", "image", "image, stiff", "gradients", "gradients, stiff"], rows)
 
@@ -165,7 +167,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="measure the cases whose group or name contains this (default: all)")
     args = parser.parse_args()
     used = [*kernels(), TEXTBOOK]
-    print(describe(CUDA_FLOAT.device if CUDA_FLOAT in used else "cpu"))
+    print(describe_machine(CUDA_FLOAT.device if CUDA_FLOAT in used else "cpu"))
     cases = [case for case in CASES if args.only in f"{case.group}: {case.name}"]
     wrong: dict[str, list[str]] = {backend.name: [] for backend in used if backend is not TEXTBOOK}
     results: dict[str, dict[str, Result]] = {name: {} for name in (*(backend.name for backend in used), ROUNDING)}
@@ -175,7 +177,7 @@ def main() -> None:
         for backend in used:
             result = results[backend.name][case.name] = judged.result(backend)
             if backend is not TEXTBOOK:
-                wrong[backend.name] += beyond(case, backend, judged, result)
+                wrong[backend.name] += find_excess(case, backend, judged, result)
     print_report(results)
     _print_verdict(len(cases), wrong)
 

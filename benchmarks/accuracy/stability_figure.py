@@ -19,9 +19,9 @@ from tqdm import tqdm
 
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, TEXTBOOK
 from benchmarks.accuracy.stability import ROUNDING, Judged, Result
-from benchmarks.harness.measuring import describe
+from benchmarks.harness.measuring import describe_machine
 from splatting.records.figures import save_figure
-from tests.workloads.stability_cases import PLAIN, Case, Problem, at_depths, needles, needles_of
+from tests.workloads.stability_cases import PLAIN, Case, Problem, make_depths, make_needles, needles
 from utils.system_utils import run_cli
 
 TEXTBOOK_DOUBLE = TEXTBOOK._replace(name="textbook float64", dtype=torch.float64)
@@ -50,10 +50,10 @@ SWEEPS = [
     Sweep(
         "length of needles, px",
         (10, 30, 100, 300, 1e3, 3e3, 1e4, 3e4, 1e5),
-        lambda length: needles_of(length, 1.2 * length),
+        lambda length: make_needles(length, 1.2 * length),
         lambda length: 1e-4 if length < 300 else 2e-3 if length < 5e3 else 0.1,
     ),
-    Sweep("depth, world units", (0.21, 0.3, 1, 10, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7), at_depths, lambda _: 1e-4),
+    Sweep("depth, world units", (0.21, 0.3, 1, 10, 1e2, 1e3, 1e4, 1e5, 1e6, 1e7), make_depths, lambda _: 1e-4),
 ]
 
 
@@ -102,7 +102,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", type=Path, help="image file to write")
     args = parser.parse_args()
-    machine = describe()
+    machine = describe_machine()
     print(machine)
     measured = {sweep.name: measure(sweep) for sweep in SWEEPS}
     draw(args.figure, measured, machine)

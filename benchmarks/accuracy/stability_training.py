@@ -25,7 +25,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from arguments import OptimizationParams
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import describe_machine, print_table
 from splatting.records.figures import save_figure
 from tests.workloads import textbook
 from tests.workloads.stability_cases import Parameters
@@ -66,7 +66,7 @@ def train(kind: str, mode: str, render: Callable = rasterize, rate: float = 1.0,
     losses, rows, wrong = [], [], 0
     for step in range(STEPS):
         if step % EVERY == 0:
-            rows.append(counted(leaves, views[:VIEWS]) | dict.fromkeys(RATES, 0.0))
+            rows.append(count_guarded(leaves, views[:VIEWS]) | dict.fromkeys(RATES, 0.0))
         k = 3 * step % VIEWS  # each view once in VIEWS steps
         loss, _ = photometric_loss(draw(leaves, own[k], render), photos[k], OPTIONS.lambda_dssim)
         adam.zero_grad()
@@ -79,7 +79,7 @@ def train(kind: str, mode: str, render: Callable = rasterize, rate: float = 1.0,
             leaf.data.copy_(leaf.data.float())
         losses.append(float(loss.detach()))
         rows[-1]["loss"] = sum(losses[-VIEWS:]) / len(losses[-VIEWS:])
-    rows.append(counted(leaves, views[:VIEWS]))
+    rows.append(count_guarded(leaves, views[:VIEWS]))
     with torch.no_grad():
         errors = [draw(leaves, v, render).clamp(0, 1) - p for v, p in zip(own[VIEWS:], photos[VIEWS:], strict=True)]
     psnr = sum(-10 * math.log10(float(error.double().square().mean())) for error in errors) / len(errors)
@@ -87,7 +87,7 @@ def train(kind: str, mode: str, render: Callable = rasterize, rate: float = 1.0,
 
 
 @torch.no_grad()
-def counted(parameters: Parameters, views: Cameras) -> dict[str, float]:
+def count_guarded(parameters: Parameters, views: Cameras) -> dict[str, float]:
     """Conditions of the covariances, and how many Gaussians, or pixels, a guard touches in any of the views."""
     gaussians = activated(Gaussians(**{name: t.detach().double() for name, t in parameters.items()}))
     touched: dict[str, Tensor] = {}
@@ -188,7 +188,7 @@ def main() -> None:
     parser.add_argument("--only", default="", help="train the kinds whose name contains this (default: all)")
     parser.add_argument("--figure", type=Path, help="image file to write")
     args = parser.parse_args()
-    print(describe())
+    print(describe_machine())
     kinds = [kind for kind in KINDS if args.only in kind]
     found = {kind: {mode: train(kind, mode) for mode in MODES} for kind in tqdm(kinds, unit="kind", leave=False)}
     for kind, runs in found.items():

@@ -14,7 +14,7 @@ from benchmarks.harness.measuring import add_device
 from gaussian_renderer import rasterizer_settings
 from scene.gaussian_model import GaussianModel
 from scene.saved_model import load_saved, read_model
-from tests.workloads.splat_scenes import COLUMNS, PARAMETERS, on_device, settings
+from tests.workloads.splat_scenes import COLUMNS, PARAMETERS, move_camera, settings
 from utils.system_utils import UserError
 
 _WIDTH, _HEIGHT, _MADE = 800, 533, 8  # of cameras for a model that has none: px, px, count
@@ -26,7 +26,7 @@ class TrainedModel(NamedTuple):
     label: str
     gaussians: Gaussians  # raw, float32
     cameras: list[GaussianRasterizationSettings]
-    made: bool  # the cameras, by `around`
+    made: bool  # the cameras, by `make_cameras_around`
 
     @property
     def count(self) -> int:
@@ -34,7 +34,7 @@ class TrainedModel(NamedTuple):
 
 
 def model_parser(doc: str) -> argparse.ArgumentParser:
-    """A parser with `models`, whose words `trained` reads, --device and --figure."""
+    """A parser with `models`, whose words `load_trained` reads, --device and --figure."""
     parser = argparse.ArgumentParser(description=doc.splitlines()[0])
     parser.add_argument(
         "models",
@@ -47,17 +47,19 @@ def model_parser(doc: str) -> argparse.ArgumentParser:
     return parser
 
 
-def trained(word: str, device: torch.device | str) -> TrainedModel:
+def load_trained(word: str, device: torch.device | str) -> TrainedModel:
     """The model that a word of the command line names: [LABEL=]PATH. UserError where there is none."""
     label, _, name = word.rpartition("=")
     path = Path(name)
     folder = path if path.is_dir() else path.resolve().parent.parent.parent
     if path.is_dir() or (folder / "cfg_args").is_file():
         iteration = -1 if path.is_dir() else _iteration(path)
-        return _of_training(label or folder.name, folder, iteration, device)
+        return _load_training(label or folder.name, folder, iteration, device)
     model = read_model(path)
-    gaussians = _raw(model, device)
-    return TrainedModel(label or path.stem, gaussians, [on_device(made, device) for made in around(gaussians)], True)
+    gaussians = _make_raw(model, device)
+    return TrainedModel(
+        label or path.stem, gaussians, [move_camera(made, device) for made in make_cameras_around(gaussians)], True
+    )
 
 
 def _iteration(ply: Path) -> int:
@@ -67,7 +69,7 @@ def _iteration(ply: Path) -> int:
     return int(number)
 
 
-def _of_training(label: str, folder: Path, iteration: int, device: torch.device | str) -> TrainedModel:
+def _load_training(label: str, folder: Path, iteration: int, device: torch.device | str) -> TrainedModel:
     parser = argparse.ArgumentParser()
     models, pipelines = ModelParams(parser), PipelineParams(parser)
     options = argparse.Namespace(**vars(parser.parse_args([])) | read_cfg_args(folder) | {"model_path": str(folder)})
@@ -75,15 +77,17 @@ def _of_training(label: str, folder: Path, iteration: int, device: torch.device 
     views = scene.getTrainCameras() + scene.getTestCameras()
     background = torch.full((3,), float(options.white_background), device=scene.gaussians.get_xyz.device)
     cameras = [rasterizer_settings(view, scene.gaussians, pipe, background) for view in views]
-    return TrainedModel(label, _raw(scene.gaussians, device), [on_device(camera, device) for camera in cameras], False)
+    return TrainedModel(
+        label, _make_raw(scene.gaussians, device), [move_camera(camera, device) for camera in cameras], False
+    )
 
 
-def _raw(model: GaussianModel, device: torch.device | str) -> Gaussians:
+def _make_raw(model: GaussianModel, device: torch.device | str) -> Gaussians:
     rows = {name: model.raw(column).detach() for name, column in zip(PARAMETERS, COLUMNS, strict=True)}
     return Gaussians(**{name: values.float().to(device).contiguous() for name, values in rows.items()})
 
 
-def around(gaussians: Gaussians) -> list[GaussianRasterizationSettings]:
+def make_cameras_around(gaussians: Gaussians) -> list[GaussianRasterizationSettings]:
     """Cameras for a model without any: on a circle, looking at the median of the means, 60 degrees wide.
 
     The circle lies in the plane of the two longest axes of the means. Its radius is twice their median distance from
@@ -97,11 +101,11 @@ def around(gaussians: Gaussians) -> list[GaussianRasterizationSettings]:
     angles = [2 * math.pi * k / _MADE for k in range(_MADE)]
     degree = round((gaussians.sh_rest.shape[1] + 1) ** 0.5) - 1
     out = [math.cos(angle) * first + math.sin(angle) * second for angle in angles]
-    looks = [_looking(middle + radius * toward, -toward, normal) for toward in out]
+    looks = [_look_at(middle + radius * toward, -toward, normal) for toward in out]
     return [settings(_WIDTH, _HEIGHT, view=view, sh_degree=degree, bg=torch.zeros(3).double()) for view in looks]
 
 
-def _looking(center: Tensor, forward: Tensor, down: Tensor) -> Tensor:
+def _look_at(center: Tensor, forward: Tensor, down: Tensor) -> Tensor:
     """World to view, (4, 4), of a camera at `center`."""
     view = torch.eye(4, dtype=torch.float64)
     view[:3, :3] = torch.stack([torch.linalg.cross(down, forward), down, forward])

@@ -1,4 +1,4 @@
-"""What `export.py --clean` leaves out of a model, of floaters put in by hand and of the rest, and what views lose.
+"""Effects of `export.py --clean`: Gaussians removed, of floaters put in by hand and of the rest, and loss of views.
 
     python -m benchmarks.exports.cleaning -m MODEL --floaters 0 200
 
@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import describe_machine, print_table
 from gaussian_renderer.camera_paths.poses import Poses, focus_point, poses_of
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
@@ -80,7 +80,7 @@ def main() -> None:
             numbers.append(f"{scores[1]:.2f} {after - scores[1]:+.3f}")
             gone_of = f"{gone[:-count].sum() if count else gone.sum():,} of {len(splats):,}"
             rows.append([f"{most:g}", f"{gone[len(splats) :].sum()} of {count}", gone_of, *numbers, f"{seconds:.1f}"])
-    print(describe(compute_device()))
+    print(describe_machine(compute_device()))
     print_table(["--clean", "floaters gone", "others gone", "training", "worst", "test", "seconds"], rows)
 
 

@@ -18,12 +18,12 @@ from torch.nn.functional import grid_sample
 
 from applications.demo.objects import Box, Ground, Sphere, Thing, demo_scene
 from applications.demo.tracer import TARGET, trace
-from applications.export.mesh import CONFIRMED, Mesh, fewer, vertex_normals, volume_of, zero_level
-from applications.export.mesh_cleaning import area_vectors, smooth_rims, whole_parts
+from applications.export.mesh import CONFIRMED, Mesh, extract_zero_level, fuse_volume, reduce_triangles, vertex_normals
+from applications.export.mesh_cleaning import area_vectors, keep_whole_parts, smooth_rims
 from applications.export.surfaces import Surfaces
-from applications.export.texture import barycentric, owners_of, textured
+from applications.export.texture import barycentric, find_owners, make_texture
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import describe_machine, print_table
 from scene.cameras import Camera
 from scene.saved_model import load_saved
 from scene.with_splats import splats_of
@@ -108,7 +108,7 @@ def picture_of(mesh: Mesh, camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     inside = (pixels[at].min(axis=1) < size).all(axis=1) & (pixels[at].max(axis=1) > 0).all(axis=1)
     drawn = at[ahead & inside]
     drawn = drawn[np.argsort(-depths[drawn].mean(axis=1))]
-    owners = owners_of(drawn, pixels, size)
+    owners = find_owners(drawn, pixels, size)
     covered = owners >= 0
     corners = drawn[owners[covered]]
     shares = barycentric(pixels, corners, np.argwhere(covered)[:, ::-1] + 0.5) / depths[corners]
@@ -142,22 +142,22 @@ def main() -> None:
     cameras, splats = scene.getTrainCameras(), splats_of(scene.gaussians, bool(args.antialiasing))
     places, rows = seen_places(things, cameras, PLACES), []
     surfaces = Surfaces(splats, cameras, pipe)
-    volume = volume_of(surfaces, args.voxel)
-    every = zero_level(volume, 1)[:2]
-    vertices, faces = whole_parts(*zero_level(volume, CONFIRMED))
+    volume = fuse_volume(surfaces, args.voxel)
+    every = extract_zero_level(volume, 1)[:2]
+    vertices, faces = keep_whole_parts(*extract_zero_level(volume, CONFIRMED))
     vertices = smooth_rims(vertices, faces)
     meshes = [("one view", *every), ("clean", vertices, faces)]
-    meshes += [("clean", *fewer(vertices, faces, count)) for count in args.triangles]
+    meshes += [("clean", *reduce_triangles(vertices, faces, count)) for count in args.triangles]
     for name, *shape in meshes:
         row = [name, f"{len(shape[1]):,}", *(f"{value:.4f}" for value in judge(*shape, things, places).values())]
         if name == "clean":
             start = time.perf_counter()
-            mesh = Mesh(*textured(*shape, vertex_normals(*shape), surfaces, volume.voxel))
+            mesh = Mesh(*make_texture(*shape, vertex_normals(*shape), surfaces, volume.voxel))
             seconds = time.perf_counter() - start
             photos, renders, covered = texture_psnr(mesh, cameras, surfaces)
             row += [f"{photos:.2f}, {renders:.2f}", f"{100 * covered:.1f}", f"{seconds:.1f}"]
         rows.append([*row, "", "", ""][:10])
-    print(describe(compute_device()))
+    print(describe_machine(compute_device()))
     names = ["accuracy", "95 %", "completeness", "95 %", f"within {CLOSE}", "PSNR: photos, renders", "covered %"]
     print_table(["mesh", "triangles", *names, "seconds of texture"], rows)
 

@@ -27,8 +27,8 @@ from benchmarks.gate.baseline import (
     read_baseline,
     write_baseline,
 )
-from benchmarks.gate.trainings import Build, Task, head, older_build, scored, tasks, timed
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.gate.trainings import Build, Task, build_older, list_tasks, read_head, train_and_score, train_and_time
+from benchmarks.harness.measuring import describe_machine, print_table
 from utils.system_utils import compute_device, run_cli
 
 SEEDS, STORED_SEEDS = (0, 1), (0, 1, 2, 3, 4)
@@ -38,12 +38,12 @@ ITERATIONS = {"cpu": 1000, "cuda": 7000}  # some seconds of training, beside whi
 
 def store(path: Path, kind: str, work: dict[str, Task], iterations: int) -> None:
     """Train every scene with the stored seeds and write the baseline of this kind of machine."""
-    commit = head()
+    commit = read_head()
     scenes: dict[str, list[dict[str, float]]] = {name: [] for name in work}
     with tqdm(total=len(work) * len(STORED_SEEDS), desc="Training", unit="run") as bar:
         for name, task in work.items():
             for seed in STORED_SEEDS:
-                found = scored(task, seed)
+                found = train_and_score(task, seed)
                 scenes[name].append({key: found[key] for key in ("seed", *(q.name for q in QUANTITIES))})
                 bar.update()
     write_baseline(path, kind, {"commit": commit, "iterations": iterations, "scenes": scenes})
@@ -56,7 +56,7 @@ def compare(stored: dict[str, list[dict]], work: dict[str, Task], build: Build) 
         for name, task in work.items():
             found, pairs = [], []
             for seed in SEEDS:
-                found.append(scored(task, seed))
+                found.append(train_and_score(task, seed))
                 bar.update()
                 pairs.append(best_times(task, seed, build, found[-1]["seconds"], bar))
             rows += [*judge_quality(name, stored[name], found), judge_time(name, pairs)]
@@ -69,7 +69,7 @@ def best_times(task: Task, seed: int, build: Build, first: float, bar: tqdm) -> 
     turns = [build, build, None]
     while turns:
         for turn in turns:
-            (now if turn is None else before).append(timed(task, seed, turn))
+            (now if turn is None else before).append(train_and_time(task, seed, turn))
             bar.update()
         slower = min(now) > MOST_TIME * min(before)
         turns = [build, None] if slower and len(now) < MOST_TURNS else []
@@ -86,13 +86,13 @@ def main() -> None:
     args = parser.parse_args()
     device = compute_device()
     iterations = ITERATIONS[device.type] if args.iterations is None else args.iterations
-    kind, work = machine_kind(), tasks(iterations)
-    print(describe(device), flush=True)
+    kind, work = machine_kind(), list_tasks(iterations)
+    print(describe_machine(device), flush=True)
     if args.write:
         store(args.baseline, kind, work, iterations)
         return
     record = read_baseline(args.baseline, kind, list(work), iterations)
-    rows = compare(record["scenes"], work, older_build(record["commit"]))
+    rows = compare(record["scenes"], work, build_older(record["commit"]))
     print_table(HEADER, [row.cells() for row in rows])
     worse = [row for row in rows if not row.passed]
     print(f"{len(worse)} of {len(rows)} are worse than at {record['commit'][:7]}" if worse else "the gate is passed")

@@ -54,7 +54,7 @@ class Row(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Whether the change is allowed; False where a number is not finite."""
+        """Tell if the change is allowed; False where a number is not finite."""
         return self.change <= self.allowed
 
     def cells(self) -> list[str]:

@@ -36,7 +36,7 @@ class Task(NamedTuple):
     options: list[str]
 
 
-def tasks(iterations: int) -> dict[str, Task]:
+def list_tasks(iterations: int) -> dict[str, Task]:
     """Return the real scenes below $GS_SHARED or beside the repository if all are there, else made ones, by name."""
     real = Path(os.environ.get("GS_SHARED") or ROOT.parent / "shared") / "scenes"
     length = ["--iterations", str(iterations), "--no_curve"]
@@ -66,7 +66,7 @@ class Build(NamedTuple):
 HERE = Build(ROOT, None)
 
 
-def older_build(commit: str) -> Build:
+def build_older(commit: str) -> Build:
     """Check a commit out below build/gate and build its extensions, if they differ from those here.
 
     UserError if git has no such commit.
@@ -103,7 +103,7 @@ def _build_extensions(folder: Path) -> None:
         raise UserError(f"the extensions of the stored build do not compile here:\n{done.stderr[-2000:]}")
 
 
-def head() -> str:
+def read_head() -> str:
     """Return the commit of this checkout. UserError if files differ from it, since it could not be built again."""
     status = ["git", "status", "--porcelain", "--untracked-files=no"]
     changed = subprocess.run(status, cwd=ROOT, capture_output=True, text=True)
@@ -113,14 +113,14 @@ def head() -> str:
     return commit.stdout.strip()
 
 
-def scored(task: Task, seed: int) -> dict[str, float]:
+def train_and_score(task: Task, seed: int) -> dict[str, float]:
     """Train by this code, render and score the test views."""
     found = _trained(task, seed, HERE, scores=True)
     counts = {"seed": seed, "Gaussians": found["gaussians"], "bytes": round(MB * found["ply_mb"])}
     return counts | {name: found[name] for name in ("PSNR", "SSIM", "seconds")}
 
 
-def timed(task: Task, seed: int, build: Build | None) -> float:
+def train_and_time(task: Task, seed: int, build: Build | None) -> float:
     """Return the training seconds of this code (None) or of an older build."""
     return _trained(task, seed, build or HERE)["seconds"]
 

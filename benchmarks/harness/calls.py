@@ -91,7 +91,7 @@ FOLLOWING = {"project_kernel": "bin", "l1_ssim_vjp_kernel": "blend_vjp"}
 STAGES = ("project", "bin", "blend", "loss", "blend_vjp", "step")
 
 
-def by_stage(launched: Iterable[tuple[str, float]]) -> list[tuple[str, str, float]]:
+def group_by_stage(launched: Iterable[tuple[str, float]]) -> list[tuple[str, str, float]]:
     """Return stage, name and time of each kernel of training steps."""
     stage, result = "project", []
     for name, milliseconds in launched:

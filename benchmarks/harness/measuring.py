@@ -16,7 +16,7 @@ from groundwork.host.machine import facts, one_line
 from utils.system_utils import UserError, compute_device
 
 
-def describe(device: torch.device | str = "cpu") -> str:
+def describe_machine(device: torch.device | str = "cpu") -> str:
     """Return one line with processor or GPU, threads, instruction set, versions and commit."""
     found = facts(device)
     return one_line(found) + (f", CUDA {found['cuda']}" if found["cuda"] else "")
@@ -28,11 +28,11 @@ def print_table(header: list[str], rows: list[list[str]]) -> None:
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:
-    """Add --device, which `chosen_device` reads."""
+    """Add --device, which `choose_device` reads."""
     parser.add_argument("--device", choices=["cpu", "cuda"], help="default: cuda if there is a GPU and CUDA kernels")
 
 
-def chosen_device(args: argparse.Namespace) -> str:
+def choose_device(args: argparse.Namespace) -> str:
     """Return "cpu" or "cuda"; UserError if a GPU is asked for and none can be used."""
     found = compute_device().type
     if args.device == "cuda" and found != "cuda":
@@ -85,13 +85,13 @@ def gpu_milliseconds(run: Callable[[], object]) -> float:
 def gpu_time(run: Callable[[], object]) -> GpuTime:
     """Return the median over REPEATS calls after WARM_UPS calls, and the kernels of a call, means over some calls."""
     events = gpu_milliseconds(run)
-    calls = [launches(run) for _ in range(_PROFILED)]
+    calls = [list_launches(run) for _ in range(_PROFILED)]
     same = [call for call in calls if [name for name, _ in call] == [name for name, _ in calls[0]]]
     means = [(of[0][0], statistics.mean(ms for _, ms in of)) for of in zip(*same, strict=True)]
     return GpuTime(events, means)
 
 
-def launches(run: Callable[[], object]) -> list[tuple[str, float]]:
+def list_launches(run: Callable[[], object]) -> list[tuple[str, float]]:
     """Return name and milliseconds of each kernel that a call runs on the device, in order."""
     torch.cuda.synchronize()
     with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as trace:
@@ -99,10 +99,10 @@ def launches(run: Callable[[], object]) -> list[tuple[str, float]]:
         torch.cuda.synchronize()
     on_device = [event for event in trace.events() if event.device_type == DeviceType.CUDA]
     on_device.sort(key=lambda event: event.time_range.start)
-    return [(short_name(event.name), event.time_range.elapsed_us() / 1e3) for event in on_device]
+    return [(shorten_name(event.name), event.time_range.elapsed_us() / 1e3) for event in on_device]
 
 
-def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:
+def measure_peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:
     """Return the peak GPU memory of a call above what was in use before it, MiB; `clear` drops the gradients."""
     run()
     clear()
@@ -116,7 +116,7 @@ def peak_mib(run: Callable[[], object], clear: Callable[[], None]) -> float:
     return peak / 2**20
 
 
-def short_name(name: str) -> str:
+def shorten_name(name: str) -> str:
     """Strip return type, namespaces, template arguments and parameters from a kernel's name."""
     if name.startswith(("Memcpy", "Memset")):
         return name.split(" (")[0]

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from benchmarks.harness.measuring import (
     add_device,
-    chosen_device,
+    choose_device,
     cpu_milliseconds,
-    describe,
+    describe_machine,
     gpu_milliseconds,
-    peak_mib,
+    measure_peak_mib,
     print_table,
 )
-from tests.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from tests.workloads.splat_scenes import CPU_WORKLOADS, GPU_WORKLOADS, SplatScene, frustum, sort_by_morton
 from utils.system_utils import run_cli
 
 _REPEATS = 5  # on a CPU
@@ -62,13 +62,13 @@ def main() -> None:
     )
     parser.add_argument("--channels", nargs="+", type=int, default=[3, 4, 16, 32, 64], help="(default: 3 4 16 32 64)")
     args = parser.parse_args()
-    device = chosen_device(args)
-    print(describe(device), end="\n\n")
+    device = choose_device(args)
+    print(describe_machine(device), end="\n\n")
     on_gpu = device != "cpu"
     workloads = {name: GPU_WORKLOADS[name] for name in args.workloads} if on_gpu else {"M": CPU_WORKLOADS["M"]}
     rows = []
     for workload, form in workloads.items():
-        scene = in_morton_order(frustum(*form, device=device))
+        scene = sort_by_morton(frustum(*form, device=device))
         base = None
         for channels in (None, *args.channels):
             call = Call(scene, channels)
@@ -76,7 +76,7 @@ def main() -> None:
                 forward = gpu_milliseconds(call.image) if on_gpu else cpu_milliseconds(call.image, _REPEATS)
             both = gpu_milliseconds(call) if on_gpu else cpu_milliseconds(call, _REPEATS)
             base = base or both
-            memory = f"{peak_mib(call, call.clear):.0f}" if on_gpu else ""
+            memory = f"{measure_peak_mib(call, call.clear):.0f}" if on_gpu else ""
             name = "rasterize" if channels is None else str(channels)
             rows.append([workload, name, f"{forward:.3f}", f"{both:.3f}", f"{both / base:.2f}", memory])
     print_table(["workload", "channels", "forward", "+ backward", "times rasterize", "MiB"], rows)

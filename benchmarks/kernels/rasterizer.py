@@ -21,17 +21,17 @@ import torch
 from diff_gaussian_rasterization.lens import Lens
 
 from arguments import ModelParams, PipelineParams, read_cfg_args
-from benchmarks.harness.calls import STAGES, TILE, Calls, Stages, by_stage
+from benchmarks.harness.calls import STAGES, TILE, Calls, Stages, group_by_stage
 from benchmarks.harness.measuring import (
     REPEATS,
     WARM_UPS,
     GpuTime,
     add_device,
-    chosen_device,
+    choose_device,
     cpu_milliseconds,
-    describe,
+    describe_machine,
     gpu_time,
-    peak_mib,
+    measure_peak_mib,
     print_table,
 )
 from gaussian_renderer import rasterizer_settings, render
@@ -108,14 +108,14 @@ class Measured:
 
     def kernels(self) -> list[tuple[str, str, float]]:
         """Return stage, name and milliseconds of the kernels of a step, in order."""
-        return by_stage(self.times["step"].launched)
+        return group_by_stage(self.times["step"].launched)
 
 
 def measure_on_gpu(name: str, scene: SplatScene) -> Measured:
     """Measure a workload."""
     calls = Calls(scene)
     # Memory first: Adam's averages would not count, but the memory that they leave in the pool could.
-    memory = [peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward)]
+    memory = [measure_peak_mib(run, calls.clear) for run in (calls.forward, calls.with_backward)]
     times = {step: gpu_time(run) for step, run in calls.steps().items()}
     del calls
     torch.cuda.empty_cache()
@@ -162,7 +162,7 @@ def _time_rows(workload: Measured) -> list[list[str]]:
 
 
 @torch.no_grad()
-def trained(folder: Path) -> SplatScene:
+def load_trained(folder: Path) -> SplatScene:
     """Return the model that train.py has left in a folder, with the view that sees the median number of Gaussians.
 
     Seeded splats in a frustum are fog, in which three quarters of the instances are hidden; of a trained model few are,
@@ -180,20 +180,20 @@ def trained(folder: Path) -> SplatScene:
     return SplatScene(rows, view.image_width, view.image_height, rasterizer_settings(view, gaussians, pipe, background))
 
 
-def workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, SplatScene]]:
+def load_workloads(args: argparse.Namespace, device: str) -> Iterator[tuple[str, SplatScene]]:
     """The requested workloads by name, one after the other: several may not fit into memory."""
     sizes = GPU_WORKLOADS if device == "cuda" else CPU_WORKLOADS
     if unknown := [name for name in args.workloads or () if name not in sizes]:
         raise UserError(f"--workloads {unknown[0]}: on this device there are {', '.join(sizes)}")
     if args.models:
-        scenes = ((folder.name, trained(folder).to(device)) for folder in args.models)
+        scenes = ((folder.name, load_trained(folder).to(device)) for folder in args.models)
     else:
         names = args.workloads or sizes
         scenes = ((name, ORDERS[args.order](frustum(*sizes[name], device=device))) for name in names)
-    return ((name, seen_by(scene, args.projection, args.lens)) for name, scene in scenes)
+    return ((name, set_lens(scene, args.projection, args.lens)) for name, scene in scenes)
 
 
-def seen_by(scene: SplatScene, projection: str, lens: str | None) -> SplatScene:
+def set_lens(scene: SplatScene, projection: str, lens: str | None) -> SplatScene:
     """The scene of that projection and kind of lens, whose middle has the pinhole's angle of view, or 360 degrees."""
     settings = scene.settings(projection=projection)
     if lens is None:
@@ -219,15 +219,15 @@ def main() -> None:
     add("--threads", type=int, nargs="+", default=[1, torch.get_num_threads()], help="CPU: numbers of threads to use")
     add("--repeats", type=int, default=9, help="CPU: number of timed calls (default: 9)")
     args = parser.parse_args()
-    device = chosen_device(args)
+    device = choose_device(args)
     print(
-        f"{describe(device)}, rows: {'as trained' if args.models else args.order}, projection: {args.projection}"
-        f", lens: {args.lens or 'none'}"
+        f"{describe_machine(device)}, rows: {'as trained' if args.models else args.order}, "
+        f"projection: {args.projection}, lens: {args.lens or 'none'}"
     )
     if device == "cuda":
-        print_gpu(workloads(args, device))
+        print_gpu(load_workloads(args, device))
     else:
-        print_cpu(workloads(args, device), args.threads, args.repeats)
+        print_cpu(load_workloads(args, device), args.threads, args.repeats)
 
 
 if __name__ == "__main__":

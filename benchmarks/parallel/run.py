@@ -55,7 +55,7 @@ class WorkloadRun(Run):
         if gpu_memory:
             self.parts = [part_class("spill")()]
             self.parts[0].check(self, None)
-            self.gaussians.room.expect(-(-workload.gaussians // self.group.size), self.scene)
+            self.gaussians.storage.reserve(-(-workload.gaussians // self.group.size), self.scene)
         self._begin(workload)
         self.views = ViewOrder(cameras, self.opt.seed)
         self.background = torch.zeros(3, device=self.device)
@@ -75,7 +75,7 @@ class WorkloadRun(Run):
     def _begin(self, workload: Workload) -> None:
         gaussians, here = self.gaussians, self.group
         gaussians.divide(here)
-        keep = torch.device("cpu") if gaussians.room.limit else self.device
+        keep = torch.device("cpu") if gaussians.storage.limit else self.device
         gaussians.set_rows(workload.rows(here.rank, here.size, self.device, keep))
         gaussians.active_sh_degree, gaussians.spatial_lr_scale = 3, _EXTENT
         gaussians.start_exposures(())
@@ -84,9 +84,9 @@ class WorkloadRun(Run):
 
     def open(self) -> None:
         """Say what is spilled, and start the clocks; nothing is written."""
-        room = self.gaussians.room
+        room = self.gaussians.storage
         if room.host_bytes(len(self.gaussians)):
-            room.settle(self.gaussians)
+            room.rebalance(self.gaussians)
             seen = share_in_view(self.gaussians.get_xyz.detach(), self._cameras)
             print("".join(f"{said}\n" for said in sentences(room, len(self.gaussians), seen, True)), end="")
         self.clock = Stopwatch()

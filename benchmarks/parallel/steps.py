@@ -31,7 +31,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import describe_machine, print_table
 from benchmarks.parallel.run import WorkloadRun
 from benchmarks.parallel.workload import ALL
 from groundwork.host.memory import peak_memory_mib
@@ -75,11 +75,11 @@ class Timing(Part):
 
     @property
     def milliseconds(self) -> list[float]:
-        """Of a step, by block."""
+        """Return the milliseconds of a step, by block."""
         return [1e3 * (end - begin) / _BLOCK for begin, end in itertools.pairwise(self._ends)]
 
 
-def digest(gaussians: GaussianModel) -> str:
+def hash_parameters(gaussians: GaussianModel) -> str:
     """The beginning of the SHA-256 of a rank's parameters."""
     found = hashlib.sha256()
     for name in ("xyz", "f_dc", "f_rest", "opacity", "scaling", "rotation"):
@@ -109,10 +109,10 @@ def measure(case: dict[str, Any]) -> dict[str, Any]:
     peaks = timing.peak_mib, peak_memory_mib(device) or 0.0
     own = {"ms": timing.milliseconds} | dict(zip(("peak", "last"), (mib + near / 2**20 for mib in peaks), strict=True))
     own["far"] = far / (near + far) if far else 0.0
-    own["digest"] = digest(run.gaussians) if case["learn"] else ""
+    own["digest"] = hash_parameters(run.gaussians) if case["learn"] else ""
     own["memory"] = torch.cuda.mem_get_info()[1] if device.type == "cuda" else 0
     count = workload.gaussians
-    return case | {"name": str(workload), "gaussians": count, "by_rank": here.everyone(own)}
+    return case | {"name": str(workload), "gaussians": count, "by_rank": here.all_gather_objects(own)}
 
 
 def launch(case: dict[str, Any], limit: float) -> dict[str, Any] | None:
@@ -136,7 +136,7 @@ def milliseconds(found: dict[str, Any]) -> float:
     return max(median(own["ms"]) for own in found["by_rank"])
 
 
-def row(case: dict[str, Any], found: dict[str, Any] | None, first: dict[str, Any] | None) -> list[str]:
+def make_row(case: dict[str, Any], found: dict[str, Any] | None, first: dict[str, Any] | None) -> list[str]:
     """A row of the table. first: the first case of the same scene; found: None of a case without a result."""
     cells = [f"{case['ranks']}", case["model"]]
     if found is None:
@@ -150,7 +150,7 @@ def row(case: dict[str, Any], found: dict[str, Any] | None, first: dict[str, Any
     return [found["name"], *cells] + [" ".join(own["digest"] for own in every)] * case["learn"]
 
 
-def bytes_each(results: list[dict[str, Any]]) -> list[str]:
+def describe_bytes(results: list[dict[str, Any]]) -> list[str]:
     """Sentences on the memory of a Gaussian, from cases that differ in their number of Gaussians alone."""
     groups: dict[str, list[dict[str, Any]]] = {}
     for found in results:
@@ -170,7 +170,7 @@ def bytes_each(results: list[dict[str, Any]]) -> list[str]:
     return said
 
 
-def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
+def list_cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     """Every combination of the options."""
     same = {name: getattr(args, name) for name in ("size", "crop", "cap", "learn", "warm_up", "blocks")}
     return [
@@ -182,7 +182,7 @@ def cases(args: argparse.Namespace) -> list[dict[str, Any]]:
     ]
 
 
-def options() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """The command's options."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
@@ -205,7 +205,7 @@ def options() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    args = options().parse_args()
+    args = make_parser().parse_args()
     if args.case:
         found = measure(args.case)
         if ranks().first:
@@ -213,16 +213,16 @@ def main() -> None:
         return
     if min(*args.ranks, args.crop, args.warm_up, args.blocks, args.rounds) < 1:
         raise UserError("--ranks, --crop, --warm_up, --blocks and --rounds take numbers from 1 on")
-    print(describe(compute_device()), flush=True)
-    every = cases(args)
+    print(describe_machine(compute_device()), flush=True)
+    every = list_cases(args)
     turns = [[launch(case, args.limit) for case in every] for _ in range(args.rounds)]
     best = [min(filter(None, of), key=milliseconds, default=None) for of in zip(*turns, strict=True)]
     rows = []
     for case, found in zip(every, best, strict=True):
         first = next((one for one in best if found and one and one["name"] == found["name"]), None)
-        rows.append(row(case, found, first))
+        rows.append(make_row(case, found, first))
     print_table(HEADER + ["parameters"] * args.learn, rows)
-    print("\n".join(bytes_each([found for found in best if found])))
+    print("\n".join(describe_bytes([found for found in best if found])))
 
 
 if __name__ == "__main__":

@@ -27,11 +27,11 @@ _DEPTH = 10.0  # of the middle of a view
 _DOWN = math.pi / 4
 
 
-def city(n: int, width: int, sigma_px: float, seed: int, device: torch.device | str) -> dict[str, Tensor]:
+def draw_city(n: int, width: int, sigma_px: float, seed: int, device: torch.device | str) -> dict[str, Tensor]:
     """Draw n Gaussians of the city: raw parameters by name, as in a SplatScene.
 
     They lie in no order. sigma_px: median size in the middle of an image of that width. Sizes are log-normal (0.8).
-    A view of `look` sees some half of them.
+    A view of `make_pose` sees some half of them.
     """
     draw = Draw(seed, device)
     ground, within = _SIDE * draw.uniform(n, 2), draw.uniform(n, 3)
@@ -48,7 +48,7 @@ def city(n: int, width: int, sigma_px: float, seed: int, device: torch.device | 
     return {"means": torch.cat([(cell + place + 0.5) * _CELL - _SIDE / 2, up[:, None]], 1)} | draw.appearance(size)
 
 
-def look(side: int) -> tuple[np.ndarray, np.ndarray]:
+def make_pose(side: int) -> tuple[np.ndarray, np.ndarray]:
     """Pose of a camera that looks down into the city from one of its four sides, each time from elsewhere.
 
     Returns a camera-to-world rotation (3, 3) and a world-to-camera translation (3,).
@@ -98,7 +98,7 @@ class Workload:
         for piece in range(first // _PIECE, -(-end // _PIECE)):
             begin = piece * _PIECE
             own = slice(max(first - begin, 0), end - begin)
-            drawn = city(_PIECE, self.width, self.sigma_px, piece, device)
+            drawn = draw_city(_PIECE, self.width, self.sigma_px, piece, device)
             for name, values in model_rows(drawn).items():
                 values = values[own]
                 if name not in rows:
@@ -112,7 +112,7 @@ class Workload:
         size = self.width // self.crop, self.height // self.crop
         fovx, fovy = (focal2fov(fov2focal(FOV, self.width), pixels) for pixels in size)
         photo = InMemory(_photo(*size))
-        poses = [look(i) if self.name == "city" else (np.eye(3), np.zeros(3)) for i in range(VIEWS)]
+        poses = [make_pose(i) if self.name == "city" else (np.eye(3), np.zeros(3)) for i in range(VIEWS)]
         infos = [
             CameraInfo(0, *pose, fovy, fovx, None, "", f"{i}", "", *size, image=photo) for i, pose in enumerate(poses)
         ]

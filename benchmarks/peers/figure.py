@@ -30,28 +30,30 @@ Curve = list[tuple[float, float]]  # seconds and dB
 Points = dict[int, tuple[float, float]]  # the same by iteration
 
 
-def curve_of(path: str) -> Curve:
+def read_points(path: str) -> Curve:
     """The points that score all test views."""
     return [(row["seconds"], row["test_psnr"]) for row in read_peer(Path(path))]
 
 
-def line_of(files: Sequence[str]) -> Curve:
+def read_line(files: Sequence[str]) -> Curve:
     """The curve of one file, or the mean of several."""
     if not files:
         raise UserError("a line needs a name and at least one file")
     if len(files) == 1:
-        return curve_of(files[0])
+        return read_points(files[0])
     curves = [read_peer(Path(file), (*PEER_REQUIRED, "iteration")) for file in files]
-    return mean_of([{int(row["iteration"]): (row["seconds"], row["test_psnr"]) for row in rows} for rows in curves])
+    return average_curves(
+        [{int(row["iteration"]): (row["seconds"], row["test_psnr"]) for row in rows} for rows in curves]
+    )
 
 
-def end_of(files: Sequence[str]) -> tuple[float, float]:
+def mean_end(files: Sequence[str]) -> tuple[float, float]:
     """The mean end of the curves."""
-    seconds, psnr = zip(*(curve_of(file)[-1] for file in files), strict=True)
+    seconds, psnr = zip(*(read_points(file)[-1] for file in files), strict=True)
     return fmean(seconds), fmean(psnr)
 
 
-def mean_of(curves: Sequence[Points]) -> Curve:
+def average_curves(curves: Sequence[Points]) -> Curve:
     """Mean seconds and mean PSNR at each iteration that all curves have. UserError if there is none."""
     shared = sorted(set.intersection(*map(set, curves)))
     if not shared:
@@ -59,7 +61,7 @@ def mean_of(curves: Sequence[Points]) -> Curve:
     return [tuple(map(fmean, zip(*(points[at] for points in curves), strict=True))) for at in shared]
 
 
-def published(path: str, scenes: Sequence[str]) -> dict[str, Curve]:
+def read_published(path: str, scenes: Sequence[str]) -> dict[str, Curve]:
     """The mean curve of each method that has all the scenes."""
     found: dict[str, dict[str, Points]] = defaultdict(lambda: defaultdict(dict))
     try:
@@ -72,7 +74,7 @@ def published(path: str, scenes: Sequence[str]) -> dict[str, Curve]:
     whole = {method: of for method, of in found.items() if of.keys() >= set(scenes)}
     if not scenes or not whole:
         raise UserError(f"{path} has no method with {' and '.join(scenes) or 'no scene: name one'}")
-    return {method: mean_of([of[scene] for scene in scenes]) for method, of in whole.items()}
+    return {method: average_curves([of[scene] for scene in scenes]) for method, of in whole.items()}
 
 
 def main() -> None:
@@ -91,17 +93,17 @@ def main() -> None:
     figure = Figure(figsize=(7.5, 4.8), layout="constrained")
     axes = figure.subplots()
     if args.published:
-        for n, (name, points) in enumerate(published(args.published[0], args.published[1:]).items()):
+        for n, (name, points) in enumerate(read_published(args.published[0], args.published[1:]).items()):
             style = {"color": "0.75", "linestyle": LINES[n % len(LINES)], "linewidth": 1}
             axes.plot(*zip(*points, strict=True), label=f"{name}, published", **style)
     for n, (name, *files) in enumerate(args.peer):
-        line = line_of(files)
+        line = read_line(files)
         style = {"marker": "s"} if len(line) == 1 else {"linestyle": LINES[n % len(LINES)]}
         axes.plot(*zip(*line, strict=True), color=PEERS, label=name, **style)
     for n, (name, *files) in enumerate(args.ours):
-        axes.plot(*zip(*line_of(files), strict=True), color=OURS[n % len(OURS)], linewidth=2, label=name)
+        axes.plot(*zip(*read_line(files), strict=True), color=OURS[n % len(OURS)], linewidth=2, label=name)
     if args.budget:
-        ends = sorted(end_of(files) for files in args.budget)
+        ends = sorted(mean_end(files) for files in args.budget)
         axes.plot(*zip(*ends, strict=True), color="#D55E00", linewidth=2, marker="o", label="ours, --time_budget")
     axes.set(xscale="log", xlabel="seconds of training", ylabel="PSNR of the test views (dB)", title=args.title)
     axes.set_ylim(bottom=args.least)

@@ -14,8 +14,8 @@ import torch
 from diff_gaussian_rasterization.gsplat import rasterization as ours
 from torch import Tensor
 
-from benchmarks.harness.measuring import describe, gpu_milliseconds, peak_mib, print_table
-from tests.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from benchmarks.harness.measuring import describe_machine, gpu_milliseconds, measure_peak_mib, print_table
+from tests.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, sort_by_morton
 from utils.system_utils import UserError, run_cli
 
 _MOST = 0.999
@@ -76,17 +76,17 @@ def main() -> None:
         import gsplat
     except ImportError:
         raise UserError("install gsplat 1.6, whose kernels are measured") from None
-    print(f"{describe('cuda')}, gsplat {gsplat.__version__}", end="\n\n")
+    print(f"{describe_machine('cuda')}, gsplat {gsplat.__version__}", end="\n\n")
     times, differences = [], []
     for workload in args.workloads:
-        scene = in_morton_order(frustum(*GPU_WORKLOADS[workload], device="cuda"))
+        scene = sort_by_morton(frustum(*GPU_WORKLOADS[workload], device="cuda"))
         for channels in args.channels:
             calls = [Call(function, scene, channels, packed=False) for function in (gsplat.rasterization, ours)]
             row = [workload, str(channels)]
             milliseconds = [(_forward(call), gpu_milliseconds(call)) for call in calls]
             row += [f"{time:.2f}" for one in milliseconds for time in one]
             row.append(f"{milliseconds[0][1] / milliseconds[1][1]:.2f}")
-            times.append(row + [f"{peak_mib(call, call.clear):.0f}" for call in calls])
+            times.append(row + [f"{measure_peak_mib(call, call.clear):.0f}" for call in calls])
             wanted, found = (call.results() for call in calls)
             apart = [difference(found[name], values) for name, values in wanted.items()]
             cells = [f"{most:.0e}, {largest:.0e}" for most, largest in apart]

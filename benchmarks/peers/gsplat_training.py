@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from arguments import ModelParams
-from benchmarks.peers.timed import DEGREE, shuffled, train
+from benchmarks.peers.timed import DEGREE, shuffle_forever, train
 from scene.cameras import Camera
 from scene.gaussians.ply import write_ply
 from scene.gaussians.start import start_rows
@@ -54,7 +54,7 @@ class View(NamedTuple):
     mask: Tensor | None
 
 
-def frame_of(cameras: Sequence[Camera]) -> Frame:
+def find_frame(cameras: Sequence[Camera]) -> Frame:
     """The frame that gsplat's defaults are made for, up to a rotation.
 
     The origin is the point nearest to all optical axes, and the median distance of a camera to it is 1.
@@ -66,7 +66,7 @@ def frame_of(cameras: Sequence[Camera]) -> Frame:
     return Frame(center, 1 / float(np.median(np.linalg.norm(centers - center, axis=1))))
 
 
-def view_of(camera: Camera, frame: Frame, background: Tensor) -> View:
+def make_view(camera: Camera, frame: Frame, background: Tensor) -> View:
     """The view of a camera in a frame."""
     matrix = world_to_camera(camera.R, camera.T, -frame.center, frame.scale)
     K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
@@ -85,10 +85,12 @@ class Training:
         except ImportError as error:
             raise UserError(f"{error}; run pip install gsplat==1.5.3") from error
         self._draw, self._mcmc, self._iterations = gsplat.rasterization, args.strategy == "mcmc", args.iterations
-        self.frame, device = frame_of(scene.getTrainCameras()), compute_device()
+        self.frame, device = find_frame(scene.getTrainCameras()), compute_device()
         self._shift = torch.from_numpy(self.frame.center + scene.info.offset)  # the frame's origin in the world
         self.background = torch.full((3,), float(options.white_background), device=device)
-        self._views = shuffled([view_of(of, self.frame, self.background) for of in scene.getTrainCameras()], args.seed)
+        self._views = shuffle_forever(
+            [make_view(of, self.frame, self.background) for of in scene.getTrainCameras()], args.seed
+        )
         self._extent = scene.cameras_extent * self.frame.scale
         self.params = torch.nn.ParameterDict(self._start(scene)).to(device)
         self._optimizers = {

@@ -17,15 +17,15 @@ from diff_gaussian_rasterization import rasterize
 from diff_gaussian_rasterization.gsplat import rasterization as ours
 from torch import Tensor
 
-from benchmarks.harness.measuring import REPEATS, describe, gpu_time, print_table
-from tests.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, in_morton_order
+from benchmarks.harness.measuring import REPEATS, describe_machine, gpu_time, print_table
+from tests.workloads.splat_scenes import GPU_WORKLOADS, SplatScene, frustum, sort_by_morton
 from utils.system_utils import UserError, run_cli
 
 Image = Callable[[], Tensor]  # (H, W, 3)
 
 
-def images(scene: SplatScene) -> dict[str, Callable[[], Image]]:
-    """What makes each way to draw a scene, by name."""
+def make_draws(scene: SplatScene) -> dict[str, Callable[[], Image]]:
+    """Make for each way to draw a scene, by name, a function that prepares a drawing function."""
     import gsplat
 
     given, (view, K, width, height) = scene.parameters, scene.pinhole()
@@ -85,12 +85,12 @@ def main() -> None:
         import gsplat
     except ModuleNotFoundError as error:
         raise UserError(f"{error}; install gsplat 1.6") from error
-    print(f"{describe('cuda')}, gsplat {gsplat.__version__}", end="\n\n")
+    print(f"{describe_machine('cuda')}, gsplat {gsplat.__version__}", end="\n\n")
     rows = []
     with torch.no_grad():
         for workload in args.workloads:
             wanted = None
-            for name, make in images(in_morton_order(frustum(*GPU_WORKLOADS[workload], device="cuda"))).items():
+            for name, make in make_draws(sort_by_morton(frustum(*GPU_WORKLOADS[workload], device="cuda"))).items():
                 try:
                     draw = make()
                     image = draw().float().clone()

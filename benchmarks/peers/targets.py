@@ -21,11 +21,11 @@ from benchmarks.peers.time_to_target import (
     Curve,
     Steps,
     best_known,
-    comparable,
+    choose_comparable,
     ecdf,
+    measure_times,
     performance_profile,
-    reached,
-    times,
+    summarise_reached,
 )
 from splatting.records.error_curve import NAME, read_peer
 from splatting.records.figures import save_figure
@@ -37,31 +37,33 @@ _SEED = re.compile(r"seed_\d+")
 _STORED = re.compile(r"(?:(.+)_)?seed\d+")
 
 
-def curve_of(file: Path, scene: str, program: str, run: str) -> Curve:
+def read_curve(file: Path, scene: str, program: str, run: str) -> Curve:
     """Read the points of a file that score all test views."""
     return Curve(scene, program, run, [(row["seconds"], row["test_psnr"]) for row in read_peer(file)])
 
 
-def curves_in(folder: Path) -> list[Curve]:
+def read_curves(folder: Path) -> list[Curve]:
     """Read the curves of a folder that is laid out as full_eval.py's output. UserError if it has none."""
     found = []
     for file in sorted([*folder.glob(f"*/**/{NAME}"), *folder.glob(f"*/**/{CURVE}")]):
         scene, *rest = file.relative_to(folder).parts[:-1]
         run = rest.pop() if rest and _SEED.fullmatch(rest[-1]) else ""
-        found.append(curve_of(file, scene, "/".join(rest) or "ours", run))
+        found.append(read_curve(file, scene, "/".join(rest) or "ours", run))
     if not found:
         raise UserError(f"{folder} has no SCENE[/PROGRAM][/seed_N]/{NAME} or {CURVE}; give an output of full_eval.py")
     return found
 
 
-def stored_in(folder: Path, scenes: Sequence[str]) -> list[Curve]:
+def read_stored(folder: Path, scenes: Sequence[str]) -> list[Curve]:
     """Read the stored curves of other programs on these scenes."""
     found = []
     for scene in scenes:
-        found += [curve_of(file, scene, file.parent.name, "") for file in sorted(folder.glob(f"*/{scene}.csv"))]
+        found += [read_curve(file, scene, file.parent.name, "") for file in sorted(folder.glob(f"*/{scene}.csv"))]
         for file in sorted(folder.glob(f"*/{scene}/*.csv")):
             if name := _STORED.fullmatch(file.stem):
-                found.append(curve_of(file, scene, " ".join(filter(None, (file.parents[1].name, name[1]))), file.stem))
+                found.append(
+                    read_curve(file, scene, " ".join(filter(None, (file.parents[1].name, name[1]))), file.stem)
+                )
     return found
 
 
@@ -71,7 +73,7 @@ def _table(curves: Sequence[Curve], by_target: Mapping[float, Mapping[str, Seque
         own = [len(curve.points) for curve in curves if curve.program == program]
         row = [program, str(len(own)), str(min(own))]
         for seconds in by_target.values():
-            count, median = reached(seconds[program])
+            count, median = summarise_reached(seconds[program])
             row += [
                 f"{100 * count / len(seconds[program]):.0f} %",
                 f"{median:.1f}" if math.isfinite(median) else "never",
@@ -108,19 +110,19 @@ def main() -> None:
     parser.add_argument("--stored", type=Path, metavar="FOLDER", help="curves of other programs (default: none)")
     parser.add_argument("--figures", type=Path, metavar="OUT", required=True, help="folder to write the figures into")
     args = parser.parse_args()
-    given = [curve for folder in args.folders for curve in curves_in(folder)]
+    given = [curve for folder in args.folders for curve in read_curves(folder)]
     if args.stored:
-        given += stored_in(args.stored, list(dict.fromkeys(curve.scene for curve in given)))
+        given += read_stored(args.stored, list(dict.fromkeys(curve.scene for curve in given)))
     names = [curve[:3] for curve in given]
     if twice := [name for name in names if names.count(name) > 1]:
         raise UserError(f"two curves are of {' '.join(filter(None, twice[0]))}; give each run a folder of its own")
-    best, (curves, left_out) = best_known(given), comparable(given)
+    best, (curves, left_out) = best_known(given), choose_comparable(given)
     if not curves:
         raise UserError("no program has all scenes; give folders of fewer scenes")
     print_table(["scene", "best known (dB)", "by"], [[name, f"{psnr:.2f}", by] for name, (psnr, by) in best.items()])
     if left_out:
         print(f"\nLeft out, as they lack a scene: {', '.join(left_out)}.")
-    by_target = {target: times(curves, best, target) for target in TARGETS}
+    by_target = {target: measure_times(curves, best, target) for target in TARGETS}
     print()
     head = [text for target in TARGETS for text in (f"within {target:g} dB", "median (s)")]
     print_table(["program", "runs", "fewest samples", *head], _table(curves, by_target))

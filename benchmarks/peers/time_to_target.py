@@ -42,7 +42,7 @@ def best_known(curves: Sequence[Curve]) -> dict[str, tuple[float, str]]:
     return best
 
 
-def comparable(curves: Sequence[Curve]) -> tuple[list[Curve], list[str]]:
+def choose_comparable(curves: Sequence[Curve]) -> tuple[list[Curve], list[str]]:
     """The curves of programs that have all scenes, and the names of the other programs."""
     scenes: dict[str, set[str]] = {}
     for curve in curves:
@@ -52,8 +52,10 @@ def comparable(curves: Sequence[Curve]) -> tuple[list[Curve], list[str]]:
     return [curve for curve in curves if curve.program not in left_out], left_out
 
 
-def times(curves: Sequence[Curve], best: Mapping[str, tuple[float, str]], target: float) -> dict[str, list[float]]:
-    """By program the seconds of each of its runs until it is within `target` dB of the best known of its scene."""
+def measure_times(
+    curves: Sequence[Curve], best: Mapping[str, tuple[float, str]], target: float
+) -> dict[str, list[float]]:
+    """Return by program the seconds of each run until it is within `target` dB of the best known of its scene."""
     found: dict[str, list[float]] = {}
     for curve in curves:
         level = best[curve.scene][0] - target
@@ -61,8 +63,8 @@ def times(curves: Sequence[Curve], best: Mapping[str, tuple[float, str]], target
     return found
 
 
-def reached(seconds: Sequence[float]) -> tuple[int, float]:
-    """How many of the runs reach a target, and the median seconds of all of them: infinite if half of them never do."""
+def summarise_reached(seconds: Sequence[float]) -> tuple[int, float]:
+    """Return the number of runs that reach a target, and the median seconds of all runs (infinite: half never do)."""
     return sum(map(math.isfinite, seconds)), statistics.median(seconds)
 
 
@@ -79,17 +81,17 @@ def ecdf(values: Sequence[float]) -> Steps:
 def performance_profile(
     curves: Sequence[Curve], best: Mapping[str, tuple[float, str]], targets: Sequence[float] = TARGETS
 ) -> dict[str, Steps]:
-    """By program the share of problems that it solves within a factor of the least seconds of any program.
+    """Return by program the share of problems that it solves within a factor of the least seconds of any program.
 
     Dolan and Moré 2002. A problem is a scene with a target; a program's seconds are the median of its runs there. A
     problem that a program does not solve counts, and one that no program solves counts for all of them. Each program
-    must have all scenes (`comparable`).
+    must have all scenes (`choose_comparable`).
     """
     ratios: dict[str, list[float]] = {}
     for scene in dict.fromkeys(curve.scene for curve in curves):
         there = [curve for curve in curves if curve.scene == scene]
         for target in targets:
-            seconds = {name: statistics.median(of) for name, of in times(there, best, target).items()}
+            seconds = {name: statistics.median(of) for name, of in measure_times(there, best, target).items()}
             least = min(seconds.values())
             for name, own in seconds.items():
                 ratios.setdefault(name, []).append(own / least if math.isfinite(own) else math.inf)

@@ -14,7 +14,7 @@ from typing import Protocol
 import torch
 
 from arguments import ModelParams, write_cfg_args
-from benchmarks.harness.measuring import describe
+from benchmarks.harness.measuring import describe_machine
 from benchmarks.peers.curve import SECONDS
 from scene.gaussian_model import GaussianModel
 from scene.scene import Scene
@@ -38,7 +38,7 @@ class Training(Protocol):
         """Write a PLY in the world of the dataset."""
 
 
-def shuffled(views: Sequence, seed: int) -> Iterator:
+def shuffle_forever(views: Sequence, seed: int) -> Iterator:
     """All views in a random order, again and again."""
     rng = random.Random(seed)
     while True:
@@ -80,7 +80,7 @@ def train(parser: ArgumentParser, start: Callable[[Scene, ModelParams, Namespace
         raise UserError(f"-m must name a new folder, got {args.model_path or 'none'}")
     torch.manual_seed(args.seed)
     training = start(Scene(options, GaussianModel(DEGREE), shuffle=False, start=False), options, args)
-    print(describe(compute_device()))
+    print(describe_machine(compute_device()))
     mkdir_p(model)
     write_cfg_args(model, options)
     run(training, model, sorted({step for step in args.save_iterations if step < args.iterations} | {args.iterations}))

@@ -36,14 +36,14 @@ _FOX = 269  # width of fox_full's photos, among those of bonsai_small
 _SIZE, _POINTS, _SAMPLES = (400, 300), 8000, 2  # of traced sets; rays of a pixel in each direction
 
 
-def photos_of(scene: Path) -> list[Path]:
+def list_photos(scene: Path) -> list[Path]:
     """The photos of a COLMAP scene, by name. UserError if it is none."""
     if not (scene / "sparse" / "0").is_dir() or not (scene / "images").is_dir():
         raise UserError(f"{scene} is no COLMAP scene with the folders images and sparse/0; name its folder as --scenes")
     return sorted(path for path in (scene / "images").iterdir() if path.is_file())
 
 
-def restricted(model: "pycolmap.Reconstruction", photos: Mapping[str, Path]) -> "pycolmap.Reconstruction":
+def restrict_model(model: "pycolmap.Reconstruction", photos: Mapping[str, Path]) -> "pycolmap.Reconstruction":
     """The poses and cameras of some photos of a model, and all its points without tracks.
 
     photos: by their names in the model the files, whose names and sizes they get. Of a file of another shape than its
@@ -57,7 +57,7 @@ def restricted(model: "pycolmap.Reconstruction", photos: Mapping[str, Path]) -> 
         key = images[name].camera_id, _size(path)
         if key not in numbers:
             numbers[key] = len(numbers) + 1
-            found.add_camera_with_trivial_rig(_resized(images[name].camera, key[1], numbers[key]))
+            found.add_camera_with_trivial_rig(_resize_camera(images[name].camera, key[1], numbers[key]))
         image = pycolmap.Image(name=path.name, camera_id=numbers[key], image_id=number)
         found.add_image_with_trivial_frame(image, images[name].cam_from_world())
     for point in model.points3D.values():
@@ -71,7 +71,7 @@ def _size(path: Path) -> tuple[int, int]:
         return image.size[::-1] if image.getexif().get(ExifTags.Base.Orientation, 1) >= _LYING else image.size
 
 
-def _resized(camera: "pycolmap.Camera", size: tuple[int, int], number: int) -> "pycolmap.Camera":
+def _resize_camera(camera: "pycolmap.Camera", size: tuple[int, int], number: int) -> "pycolmap.Camera":
     import pycolmap
 
     camera = pycolmap.Camera(camera.todict() | {"camera_id": number})
@@ -85,7 +85,7 @@ def _resized(camera: "pycolmap.Camera", size: tuple[int, int], number: int) -> "
     return camera
 
 
-def _taken(photos: Sequence[Path], out: Path, width: int = 0, before: str = "") -> dict[str, Path]:
+def _write_photos(photos: Sequence[Path], out: Path, width: int = 0, before: str = "") -> dict[str, Path]:
     """Write photos into OUT/input, with a word before their names; return them by the names that they had.
 
     width: in pixels; 0: the files as they are.
@@ -106,17 +106,17 @@ def _write_truth(scene: Path, out: Path, photos: Mapping[str, Path]) -> None:
     import pycolmap
 
     mkdir_p(out / "truth")
-    restricted(pycolmap.Reconstruction(str(scene / "sparse" / "0")), photos).write_binary(str(out / "truth"))
+    restrict_model(pycolmap.Reconstruction(str(scene / "sparse" / "0")), photos).write_binary(str(out / "truth"))
 
 
-def thinned(scene: Path, out: Path, every: int, width: int) -> None:
+def make_thinned(scene: Path, out: Path, every: int, width: int) -> None:
     """Every so many photos of a scene by name, some pixels wide (0: the files as they are), and their truth."""
-    _write_truth(scene, out, _taken(photos_of(scene)[::every], out, width))
+    _write_truth(scene, out, _write_photos(list_photos(scene)[::every], out, width))
 
 
-def crops(scene: Path, out: Path, count: int) -> None:
+def make_crops(scene: Path, out: Path, count: int) -> None:
     """Turned parts of a scene's photos, in the order of these, to measure run time."""
-    photos, rng = photos_of(scene), np.random.default_rng(0)
+    photos, rng = list_photos(scene), np.random.default_rng(0)
     mkdir_p(out / "input")
     for number in range(count):
         with Image.open(photos[number * len(photos) // count]) as image:
@@ -132,31 +132,31 @@ def crops(scene: Path, out: Path, count: int) -> None:
         part.save(out / "input" / f"crop_{number:05d}.jpg", quality=_QUALITY)
 
 
-def two_places(scene: Path, other: Path, out: Path, width: int) -> None:
+def make_two_places(scene: Path, other: Path, out: Path, width: int) -> None:
     """Photos of two scenes whose names sort apart; the truth is that of the first. width: of the second's photos."""
-    _write_truth(scene, out, _taken(photos_of(scene), out, before="a_"))
-    _taken(photos_of(other), out, width, before="b_")
+    _write_truth(scene, out, _write_photos(list_photos(scene), out, before="a_"))
+    _write_photos(list_photos(other), out, width, before="b_")
 
 
-def foreign(scene: Path, other: Path, out: Path, count: int, width: int) -> None:
+def make_foreign(scene: Path, other: Path, out: Path, count: int, width: int) -> None:
     """A scene's photos and some of another, spread evenly over its names."""
-    _write_truth(scene, out, _taken(photos_of(scene), out))
-    photos = photos_of(other)
-    _taken([photos[k * len(photos) // count] for k in range(count)], out, width, before="foreign_")
+    _write_truth(scene, out, _write_photos(list_photos(scene), out))
+    photos = list_photos(other)
+    _write_photos([photos[k * len(photos) // count] for k in range(count)], out, width, before="foreign_")
 
 
-def mirrored(scene: Path, out: Path) -> None:
+def make_mirrored(scene: Path, out: Path) -> None:
     """A scene's photos, and every third once more with left and right exchanged."""
-    _write_truth(scene, out, _taken(photos_of(scene), out))
-    for path in _taken(photos_of(scene)[::3], out, before="mirrored_").values():
+    _write_truth(scene, out, _write_photos(list_photos(scene), out))
+    for path in _write_photos(list_photos(scene)[::3], out, before="mirrored_").values():
         with Image.open(path) as image:
             turned = image.transpose(Image.Transpose.FLIP_LEFT_RIGHT)
         turned.save(path, "JPEG", quality=_QUALITY)
 
 
-def phone(scene: Path, out: Path) -> None:
+def make_phone(scene: Path, out: Path) -> None:
     """A scene's photos as a phone leaves them: some turned by EXIF, a PNG, a wide crop, a text and a hidden file."""
-    taken = _taken(photos_of(scene), out)
+    taken = _write_photos(list_photos(scene), out)
     for number, (name, path) in enumerate(taken.items()):
         with Image.open(path) as image:
             image.load()
@@ -175,7 +175,7 @@ def phone(scene: Path, out: Path) -> None:
     (out / "input" / ".nomedia").write_bytes(b"")
 
 
-def traced(name: str, out: Path, size: tuple[int, int] = _SIZE) -> None:
+def make_traced(name: str, out: Path, size: tuple[int, int] = _SIZE) -> None:
     """Ray-trace a set of TRACED. That of the video has its frames apart, as names of its truth."""
     views, things = TRACED[name]
     write_scene(out, views(*size), things, _POINTS, np.random.default_rng(0), _SAMPLES)
@@ -205,30 +205,30 @@ def _write_video(out: Path) -> None:
             writer.send(image.convert("RGB").tobytes())
     writer.close()
     (out / "images").rmdir()
-    restricted(pycolmap.Reconstruction(str(out / "truth")), frames).write_binary(str(out / "truth"))
+    restrict_model(pycolmap.Reconstruction(str(out / "truth")), frames).write_binary(str(out / "truth"))
 
 
 SETS: dict[str, Callable[[Path, Path], None]] = {
     # Photos of bonsai_full are 800 pixels wide.
     **{
-        f"bonsai{width}_{every}": lambda scenes, out, width=width, every=every: thinned(
+        f"bonsai{width}_{every}": lambda scenes, out, width=width, every=every: make_thinned(
             scenes / "bonsai_full", out, every, 0 if width == 800 else width
         )
         for width, every in ((400, 1), (400, 2), (800, 1), (800, 2), (800, 4), (3200, 1))
     },
     **{
-        name: lambda scenes, out, name=name: thinned(scenes / name, out, 1, 0)
+        name: lambda scenes, out, name=name: make_thinned(scenes / name, out, 1, 0)
         for name in ("tt_train", "fox_full", "fox_raw", "monstree_raw", "bonsai_small")
     },
     **{
-        f"crops{count}": lambda scenes, out, count=count: crops(scenes / "bonsai_full", out, count)
+        f"crops{count}": lambda scenes, out, count=count: make_crops(scenes / "bonsai_full", out, count)
         for count in (375, 1500)
     },
-    **{name: lambda _, out, name=name: traced(name, out) for name in TRACED},
-    "two_places": lambda scenes, out: two_places(scenes / "bonsai_small", scenes / "fox_full", out, _FOX),
-    "mirrored": lambda scenes, out: mirrored(scenes / "bonsai_small", out),
-    "foreign": lambda scenes, out: foreign(scenes / "bonsai_small", scenes / "fox_full", out, 20, _FOX),
-    "phone": lambda scenes, out: phone(scenes / "monstree_mixed", out),
+    **{name: lambda _, out, name=name: make_traced(name, out) for name in TRACED},
+    "two_places": lambda scenes, out: make_two_places(scenes / "bonsai_small", scenes / "fox_full", out, _FOX),
+    "mirrored": lambda scenes, out: make_mirrored(scenes / "bonsai_small", out),
+    "foreign": lambda scenes, out: make_foreign(scenes / "bonsai_small", scenes / "fox_full", out, 20, _FOX),
+    "phone": lambda scenes, out: make_phone(scenes / "monstree_mixed", out),
 }
 
 

@@ -1,4 +1,4 @@
-"""What convert.py makes of sets of photos: seconds, photos placed, errors of places and lenses, and PSNR.
+"""Results of convert.py on sets of photos: seconds, photos placed, errors of places and lenses, and PSNR.
 
     python -m benchmarks.scenes.conversion SCENES --rows fox_raw bonsai400/2 --train 60
     python -m benchmarks.scenes.conversion SCENES --rows fox_raw bonsai_small --train 20 --figure stages.png
@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
-from benchmarks.harness.measuring import describe, print_table
-from benchmarks.scenes.captures import make, restricted
+from benchmarks.harness.measuring import describe_machine, print_table
+from benchmarks.scenes.captures import make, restrict_model
 from splatting.records.figures import save_figure
 from splatting.records.model_folder import curve_of
 from utils.system_utils import UserError, run_cli
@@ -132,7 +132,7 @@ def convert(photos: Path, run: Path, options: Sequence[str], checkout: Path) -> 
     return result
 
 
-def truth_of(photos: Path, run: Path) -> "pycolmap.Reconstruction | None":
+def read_truth(photos: Path, run: Path) -> "pycolmap.Reconstruction | None":
     """The true poses of a set, by the names of the photos in `run`; None if they are not known."""
     import pycolmap  # after Pillow
 
@@ -145,7 +145,7 @@ def truth_of(photos: Path, run: Path) -> "pycolmap.Reconstruction | None":
     frames = sorted((photos / "frames").iterdir())
     small = np.stack(list(map(_small, frames)))
     taken = sorted((run / "input").iterdir())
-    return restricted(truth, {frames[np.abs(small - _small(path)).sum(1).argmin()].name: path for path in taken})
+    return restrict_model(truth, {frames[np.abs(small - _small(path)).sum(1).argmin()].name: path for path in taken})
 
 
 def _small(path: Path) -> np.ndarray:
@@ -153,7 +153,7 @@ def _small(path: Path) -> np.ndarray:
         return np.asarray(image.convert("L").resize(_SMALL, Image.Resampling.BOX), dtype=np.float32).ravel()
 
 
-def similarity(of: np.ndarray, to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fit_similarity(of: np.ndarray, to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The scaled rotation (3, 3) and the shift (3,) that take points (N, 3) to others by least squares (Umeyama 1991).
 
     It mirrors nothing.
@@ -166,7 +166,7 @@ def similarity(of: np.ndarray, to: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return turned, other - turned @ middle
 
 
-def errors_of(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+def measure_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Distances (N,) of places (N, 3), N at least 3, after the similarity on which most agree, as shares of the radius.
 
     The best of many draws of three places, by the sum of the errors up to _WRONG (MSAC), then least squares on those
@@ -175,7 +175,7 @@ def errors_of(found: np.ndarray, true: np.ndarray) -> np.ndarray:
     radius, rng = np.linalg.norm(true - true.mean(0), axis=1).mean(), np.random.default_rng(0)
 
     def after(chosen: np.ndarray) -> np.ndarray:
-        turned, shift = similarity(found[chosen], true[chosen])
+        turned, shift = fit_similarity(found[chosen], true[chosen])
         return np.linalg.norm(found @ turned.T + shift - true, axis=1) / radius
 
     def cost(errors: np.ndarray) -> float:
@@ -183,16 +183,16 @@ def errors_of(found: np.ndarray, true: np.ndarray) -> np.ndarray:
 
     best = min((after(rng.choice(len(found), 3, replace=False)) for _ in range(_DRAWS)), key=cost)
     for _ in range(_REFITS):
-        best = min(best, after(agreeing(best)), key=cost)
+        best = min(best, after(find_agreeing(best)), key=cost)
     return best
 
 
-def agreeing(errors: np.ndarray) -> np.ndarray:
-    """Which places (N,) are right, or, where most are wrong, the better half."""
+def find_agreeing(errors: np.ndarray) -> np.ndarray:
+    """Return a mask (N,) of the places that are right, or, where most are wrong, of the better half."""
     return errors <= max(_WRONG, float(np.median(errors)))
 
 
-def beside(found: "pycolmap.Reconstruction", truth: "pycolmap.Reconstruction") -> Places | None:
+def compare_poses(found: "pycolmap.Reconstruction", truth: "pycolmap.Reconstruction") -> Places | None:
     """Compare the photos of a model with their true poses; None if fewer than three have one."""
     ours, theirs = ({image.name: image for image in of.images.values() if image.has_pose} for of in (found, truth))
     names = sorted(ours.keys() & theirs.keys())
@@ -200,10 +200,10 @@ def beside(found: "pycolmap.Reconstruction", truth: "pycolmap.Reconstruction") -
         return None
     pairs = [(ours[name], theirs[name]) for name in names]
     centers = np.array([[image.projection_center() for image in pair] for pair in pairs])
-    errors = errors_of(centers[:, 0], centers[:, 1])
+    errors = measure_errors(centers[:, 0], centers[:, 1])
     turns = np.array([[image.cam_from_world().rotation.matrix() for image in pair] for pair in pairs])
     # The turn between the worlds, by the cameras: places on a line leave it open.
-    right = turns[agreeing(errors)]
+    right = turns[find_agreeing(errors)]
     u, _, v = np.linalg.svd((right[:, 1].transpose(0, 2, 1) @ right[:, 0]).sum(0))
     between = u @ np.diag([1, 1, np.linalg.det(u @ v)]) @ v
     off = np.linalg.norm(turns[:, 1] @ between - turns[:, 0], axis=(1, 2))
@@ -219,7 +219,7 @@ def write_official(run: Path, found: "pycolmap.Reconstruction", truth: "pycolmap
     (out / "sparse" / "0").mkdir(parents=True)
     (out / "images").symlink_to((run / "input").resolve())
     photos = {name: run / "input" / name for name in placed}
-    restricted(truth, photos).write_binary(str(out / "sparse" / "0"))
+    restrict_model(truth, photos).write_binary(str(out / "sparse" / "0"))
     return out
 
 
@@ -244,15 +244,15 @@ def page_seconds(model: Path, page: Path) -> float:
     return time.perf_counter() - start
 
 
-def measured(photos: Path, run: Path, options: Sequence[str], checkout: Path, seconds: float) -> Result:
+def measure_conversion(photos: Path, run: Path, options: Sequence[str], checkout: Path, seconds: float) -> Result:
     """Convert a set, compare the result with its truth, and train on it for some seconds, if they are not 0."""
     import pycolmap
 
     result = convert(photos, run, options, checkout)
     if not result.report:
         return result
-    found, truth = pycolmap.Reconstruction(str(run / "sparse" / "0")), truth_of(photos, run)
-    result.places = beside(found, truth) if truth else None
+    found, truth = pycolmap.Reconstruction(str(run / "sparse" / "0")), read_truth(photos, run)
+    result.places = compare_poses(found, truth) if truth else None
     if seconds:
         official = write_official(run, found, truth) if result.places else None
         start = time.perf_counter()
@@ -270,7 +270,7 @@ HEADER = [
 ]
 
 
-def cells(result: Result) -> list[str]:
+def format_cells(result: Result) -> list[str]:
     """A result's cells below HEADER, from the photos on."""
     report, places = result.report, result.places
     photos, placed, named, compared, judged = "", result.said, "", [""] * 8, ["", ""]
@@ -287,7 +287,7 @@ def cells(result: Result) -> list[str]:
     return [photos, f"{result.seconds:.1f}", placed, named, *compared, *judged, *ended]
 
 
-def stages_of(results: Sequence[Result]) -> list[str]:
+def list_stages(results: Sequence[Result]) -> list[str]:
     """The stages of any of the results, in order."""
     return [stage for stage in STAGES if any(stage in result.stages for result in results)]
 
@@ -295,7 +295,7 @@ def stages_of(results: Sequence[Result]) -> list[str]:
 def stage_table(labels: Sequence[list[str]], results: Sequence[Result]) -> list[list[str]]:
     """The seconds of each stage in each conversion that tells them."""
     return [
-        [*label, *(f"{result.stages[stage]:.1f}" if stage in result.stages else "" for stage in stages_of(results))]
+        [*label, *(f"{result.stages[stage]:.1f}" if stage in result.stages else "" for stage in list_stages(results))]
         for label, result in zip(labels, results, strict=True)
         if result.stages
     ]
@@ -310,7 +310,7 @@ def draw(path: Path, labels: Sequence[list[str]], results: Sequence[Result]) -> 
     figure = Figure(figsize=(9, 1.4 + 0.55 * len(names)), layout="constrained")
     axes = figure.subplots()
     ends = np.zeros(len(names))
-    for number, stage in enumerate(stages_of(results)):
+    for number, stage in enumerate(list_stages(results)):
         seconds = np.array([result.stages.get(stage, 0.0) for result in results])
         axes.barh(names, seconds, left=ends, label=stage, color=f"C{number}", height=0.65)
         for row in np.flatnonzero(seconds > 0.04 * max(sum(result.stages.values()) for result in results)):
@@ -344,20 +344,22 @@ def main() -> None:
             options = f"{row.options} {args.options}".strip()
             folder = re.sub(r"\W+", "_", f"{row.name} {options} {number or ''}").strip("_")
             words = shlex.split(options.replace("{set}", shlex.quote(str(photos))))
-            result = measured(photos, out / "runs" / folder, words, checkout.resolve(), args.train)
+            result = measure_conversion(photos, out / "runs" / folder, words, checkout.resolve(), args.train)
             labels.append([*([str(checkout)] if several else []), row.name, options.replace("{set}/", "")])
             results.append(result)
-            shown = filter(None, [*labels[-1], *cells(result), *result.psnr])
+            shown = filter(None, [*labels[-1], *format_cells(result), *result.psnr])
             print(*shown, sep="  ", file=sys.stderr, flush=True)
     scored = [[f"{psnr:.2f}" if psnr is not None else "" for psnr in result.psnr] for result in results]
     code = ["code"] if several else []
-    print(describe())
+    print(describe_machine())
     header = [*code, *HEADER, *(["PSNR, dB", "true poses"] if args.train else [])]
     rows = zip(labels, results, scored, strict=True)
-    print_table(header, [[*label, *cells(result), *(psnr if args.train else [])] for label, result, psnr in rows])
+    print_table(
+        header, [[*label, *format_cells(result), *(psnr if args.train else [])] for label, result, psnr in rows]
+    )
     if seconds := stage_table(labels, results):
         print()
-        print_table([*code, *HEADER[:2], *(f"{stage}, s" for stage in stages_of(results))], seconds)
+        print_table([*code, *HEADER[:2], *(f"{stage}, s" for stage in list_stages(results))], seconds)
     if args.figure:
         draw(args.figure, labels, results)
 

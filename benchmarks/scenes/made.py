@@ -25,7 +25,7 @@ _STOPS, _BALANCE, _FALLOFF = 1.0, 0.15, 0.5  # largest exposure; deviation of a 
 _SKY = 1e4  # units away, where the cameras stand within four of each other
 
 
-def with_balls(photo: int | None) -> list[Thing]:
+def add_balls(photo: int | None) -> list[Thing]:
     """The demo's things, and in 30 % of the photos balls somewhere among them; never in test photos."""
     things = demo_scene()
     if photo is not None and photo % HOLD and photo % 10 in (1, 4, 7):
@@ -36,13 +36,13 @@ def with_balls(photo: int | None) -> list[Thing]:
     return things
 
 
-def with_wall(_: int | None) -> list[Thing]:
+def add_wall(_: int | None) -> list[Thing]:
     """The demo's things, and a wall of one colour behind them."""
     grey = np.full((3, 1), 0.7, np.float32)
     return [*demo_scene(), Thing(Box((0.1, -1.2, 2.0), (2.4, 1.2, 0.1), 0.0), lambda p: np.broadcast_to(grey, p.shape))]
 
 
-def with_sky(photo: int | None) -> list[Thing]:
+def add_sky(photo: int | None) -> list[Thing]:
     """The demo's things before a sky so far away that it has no points."""
     things = demo_scene()[1:]
     if photo is None:
@@ -53,26 +53,26 @@ def with_sky(photo: int | None) -> list[Thing]:
 
 MADE = {
     "clean": {},
-    "sky": {"things": with_sky},
-    "balls": {"things": with_balls},
+    "sky": {"things": add_sky},
+    "balls": {"things": add_balls},
     "exposure": {},
-    "wall": {"things": with_wall},
+    "wall": {"things": add_wall},
     "fisheye": {"camera": "fisheye"},
     "panorama": {"camera": "panorama"},
 }
 
 
-def made(name: str, out: Path) -> Path:
+def write_made(name: str, out: Path) -> Path:
     """Write the scene of a name of MADE."""
     make_scene(out, _VIEWS, *((384, 192) if name == "panorama" else _SIZE), _POINTS, seed=0, **MADE[name])
     if name == "exposure":
         photos = sorted((out / "images").iterdir())
-        expose([path for k, path in enumerate(photos) if k % HOLD])
-        by_another_camera(out / "sparse" / "0", [path.name for path in photos[::HOLD]])
+        expose_photos([path for k, path in enumerate(photos) if k % HOLD])
+        split_cameras(out / "sparse" / "0", [path.name for path in photos[::HOLD]])
     return out
 
 
-def by_another_camera(model: Path, names: list[str]) -> None:
+def split_cameras(model: Path, names: list[str]) -> None:
     """Give photos of a COLMAP model of one camera another one that is the same, as text."""
     import pycolmap  # after Pillow
 
@@ -88,7 +88,7 @@ def by_another_camera(model: Path, names: list[str]) -> None:
     images.write_text(text)
 
 
-def expose(photos: list[Path]) -> None:
+def expose_photos(photos: list[Path]) -> None:
     """Take photos again, with exposures and balances whose mean over all is 0 stops, and the falloff of a lens.
 
     In linear light: pixels are those of sRGB (IEC 61966-2-1), and light beyond white is lost. The falloff is the fourth
@@ -116,7 +116,7 @@ def main() -> None:
     for name in args.names:
         if (args.out / name).exists():
             raise UserError(f"{args.out / name} exists; name another folder")
-        made(name, args.out / name)
+        write_made(name, args.out / name)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a training leaves out by itself: what each omission saves, and what it costs in PSNR.
+"""Costs of what a training leaves out by itself: the seconds that each omission saves, and the PSNR that it costs.
 
     python -m benchmarks.scenes.omission SCENE ... --seeds 0 1 2 --gpus 0 1 -- --iterations 7000
 
@@ -12,13 +12,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.harness.measuring import describe, print_table
+from benchmarks.harness.measuring import describe_machine, print_table
 from benchmarks.harness.trainings import Training, arguments, train_all
 from utils.system_utils import run_cli
 
 
-def _all_bands_at_once(run: Any, iteration: int) -> int:
-    """In place of `Run._raises_degree`."""
+def _raise_all_bands(run: Any, iteration: int) -> int:
+    """Switch on all SH bands at once; stands in for `Run._raises_degree`."""
     return run.gaussians.max_sh_degree if iteration == 1 else 0
 
 
@@ -26,7 +26,7 @@ NOTHING = "nothing"
 OMISSIONS = {  # what is left in, and by which words and changes
     NOTHING: Training(()),
     "rows that sleep": Training((), {"scene.sleeping:MOST_SHARE": 0.0}),
-    "SH bands before their turn": Training((), {"splatting.run:Run._raises_degree": _all_bands_at_once}),
+    "SH bands before their turn": Training((), {"splatting.run:Run._raises_degree": _raise_all_bands}),
     "Gaussians unseen at the end": Training(("--keep_unseen",)),
     # With --time_budget alone.
     "large photos of a short training": Training(
@@ -42,7 +42,7 @@ COLUMNS = {  # heading: key of a record, digits
 }
 
 
-def rows_of(names: Sequence[str], records: Sequence[dict[str, Any]]) -> list[list[str]]:
+def make_rows(names: Sequence[str], records: Sequence[dict[str, Any]]) -> list[list[str]]:
     """Rows of the table of one scene: medians, then what leaving one thing in adds to them.
 
     records: for each seed in turn, of each name, of which the first is NOTHING.
@@ -71,7 +71,7 @@ def main() -> None:
     args, words = arguments(parser, [0, 1, 2])
     names = list(dict.fromkeys([NOTHING, *args.left_in]))
     left_in = [OMISSIONS[name] for name in names]
-    print(describe("cuda" if args.gpus else "cpu"))
+    print(describe_machine("cuda" if args.gpus else "cpu"))
     for scene in args.scenes:  # an interrupted run keeps the tables before
         trainings = [
             Training(("-s", scene, "--seed", str(seed), *words, *one.words), one.changes)
@@ -80,7 +80,7 @@ def main() -> None:
         ]
         records = list(train_all(trainings, args.gpus))
         print(f"\n{Path(scene).name}\n")
-        print_table(["left in", *COLUMNS], rows_of(names, records))
+        print_table(["left in", *COLUMNS], make_rows(names, records))
 
 
 if __name__ == "__main__":

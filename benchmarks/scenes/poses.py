@@ -16,7 +16,7 @@ from scene.reprojection import moved_pose
 from utils.system_utils import UserError, run_cli
 
 
-def disturbed(scene: Path, out: Path, degrees: float, percent: float, seed: int) -> Path:
+def disturb_poses(scene: Path, out: Path, degrees: float, percent: float, seed: int) -> Path:
     """Write a scene with the photos of another, whose cameras have turned and moved in random directions."""
     import pycolmap  # after Pillow
 
@@ -46,7 +46,7 @@ def main() -> None:
         raise UserError(f"{args.scene} is no COLMAP scene with a folder sparse/0; name one")
     if args.out.exists():
         raise UserError(f"{args.out} exists; name a new folder")
-    disturbed(args.scene, args.out, args.degrees, args.percent, args.seed)
+    disturb_poses(args.scene, args.out, args.degrees, args.percent, args.seed)
 
 
 if __name__ == "__main__":

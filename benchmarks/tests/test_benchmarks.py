@@ -137,7 +137,7 @@ def test_stages_from_photos_to_a_page_are_in_their_order(tmp_path):
         conversion.Result(1.0, 2, "no photos", 1.0),
     ]
     labels = [["fox", ""], ["none", ""]]
-    assert conversion.stages_of(results) == ["features", "mapping", "rest", "training", "page"]
+    assert conversion.list_stages(results) == ["features", "mapping", "rest", "training", "page"]
     assert conversion.stage_table(labels, results) == [["fox", "", "5.0", "2.0", "3.0", "20.0", "4.0"]]
     conversion.draw(tmp_path / "stages.png", labels, results)
     assert (tmp_path / "stages.png").read_bytes().startswith(b"\x89PNG")

@@ -9,7 +9,7 @@ from diff_gaussian_rasterization import Gaussians
 from gaussians import model
 
 from benchmarks.accuracy import census
-from benchmarks.accuracy.splat_shapes import cells, seen
+from benchmarks.accuracy.splat_shapes import count_cells, measure_splats
 from tests.workloads.splat_scenes import settings
 
 # On the axis at depths 5 and 2, behind the camera, and not finite; flat ones as seen by the camera.
@@ -26,7 +26,7 @@ GAUSSIANS = Gaussians(
 
 def test_numbers_of_splats_on_the_axis():
     camera = settings(100, 100)
-    (splats,) = seen(GAUSSIANS, camera)
+    (splats,) = measure_splats(GAUSSIANS, camera)
     focal = 50 / math.tan(math.radians(30))
     assert splats.row.tolist() == [0, 1]
     across = [[focal * 0.5 / 5, focal * 0.004 / 5], [focal * 0.2 / 2] * 2]
@@ -40,10 +40,10 @@ def test_numbers_of_splats_on_the_axis():
     }
     for name, values in expected.items():
         assert getattr(splats, name).tolist() == pytest.approx(values, rel=1e-6), name
-    assert cells(splats) == {(2, 0, 2, 2, 0): 1, (1, 0, 0, 3, 0): 1}
+    assert count_cells(splats) == {(2, 0, 2, 2, 0): 1, (1, 0, 0, 3, 0): 1}
     covariances = torch.tensor([[0.25, 0, 0, 1.6e-5, 0, 0.01]])
     given = GAUSSIANS._replace(means=GAUSSIANS.means[:1], opacities=splats.opacity[:1, None])
-    (same,) = seen(given._replace(scales=None, rotations=None, cov3d=covariances), camera, raw=False)
+    (same,) = measure_splats(given._replace(scales=None, rotations=None, cov3d=covariances), camera, raw=False)
     assert [float(value[0]) for value in same] == pytest.approx([float(value[0]) for value in splats], rel=1e-4)
 
 

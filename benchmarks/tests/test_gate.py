@@ -92,11 +92,11 @@ def stand_in(monkeypatch, tmp_path):
     def scored(task, seed):
         return STORED[seed] | {"seconds": timed(task, seed, None), "hash": ""}
 
-    monkeypatch.setattr(gate, "tasks", lambda iterations: {name: None for name in "abc"})
-    monkeypatch.setattr(gate, "older_build", lambda commit: trainings.Build(tmp_path, None))
-    monkeypatch.setattr(gate, "timed", timed)
-    monkeypatch.setattr(gate, "scored", scored)
-    monkeypatch.setattr(gate, "head", lambda: "d" * 40)
+    monkeypatch.setattr(gate, "list_tasks", lambda iterations: {name: None for name in "abc"})
+    monkeypatch.setattr(gate, "build_older", lambda commit: trainings.Build(tmp_path, None))
+    monkeypatch.setattr(gate, "train_and_time", timed)
+    monkeypatch.setattr(gate, "train_and_score", scored)
+    monkeypatch.setattr(gate, "read_head", lambda: "d" * 40)
     path = tmp_path / "gate.json"
     monkeypatch.setattr("sys.argv", ["gate", "--baseline", str(path)])
     return path, turns, seconds

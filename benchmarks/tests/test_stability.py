@@ -11,7 +11,7 @@ from rasterizer_tools import gradients, leaves, one_splat, render
 
 from benchmarks.accuracy import stability
 from benchmarks.accuracy.runs import CPU_FLOAT, TEXTBOOK, kernels
-from benchmarks.accuracy.stability import Judged, beyond
+from benchmarks.accuracy.stability import Judged, find_excess
 from tests.workloads.splat_scenes import settings
 from tests.workloads.stability_cases import CASES, Case, long_needles
 
@@ -32,7 +32,7 @@ def test_a_case_is_within_its_bound(case, device):
     assert case.bound.reason
     measured = judged(case)
     for backend in backends:
-        assert beyond(case, backend, measured, measured.result(backend)) == []
+        assert find_excess(case, backend, measured, measured.result(backend)) == []
 
 
 def test_the_bounds_could_fail():

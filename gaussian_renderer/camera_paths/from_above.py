@@ -1,7 +1,7 @@
 """A picture of a scene from straight above (render.py --path top).
 
-The rasterizer has no orthographic projection, so a camera far away with a small opening angle takes its place: what is
-higher by the width of the picture is larger by one part in `_AWAY`.
+The rasterizer has no orthographic projection, so a camera far away with a small opening angle takes its place: things
+that are higher by the width of the picture look larger by one part in `_AWAY`.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from gaussian_renderer.camera_paths.poses import Poses, keyframe, poses_of, unit
 from gaussian_renderer.camera_paths.render_path import TOP
 from gaussian_renderer.camera_paths.start import best_start
 from gaussian_renderer.free_view import free_view
-from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer.memory_errors import explain_memory_errors
 from groundwork.files.image_files import save_png
 from groundwork.files.similarity import Similarity, local_similarity
 from scene.scene import Scene
@@ -33,9 +33,9 @@ _AROUND = 0.5  # of the cameras' largest distance from their middle, that is sho
 def render_top(
     scene: Scene, source_path: str, pipe: argparse.Namespace, background: torch.Tensor, size: tuple[int, int] | None
 ) -> Path:
-    """Write MODEL/videos/ours_N/top.png and return its path. size: width and height, None: by what is there.
+    """Write MODEL/videos/ours_N/top.png and return its path. size: width and height, None: from the scene's shape.
 
-    What is higher than all training cameras is left out, such as a ceiling: no photo shows it from above.
+    Gaussians above all training cameras are left out, such as a ceiling: no photo shows them from above.
     """
     cameras = scene.getTrainCameras()
     if not cameras:
@@ -59,7 +59,7 @@ def render_top(
     pose = keyframe(0.0, place, np.column_stack([axes[0], -axes[2], axes[1]]), math.degrees(fov))
     view = free_view(width, height, fov, pose.position, pose.wxyz, background.device)
     part = scene.gaussians.part(below, scene.gaussians.active_sh_degree)
-    with memory_errors_explained(part, [view], "pass a smaller --size"):
+    with explain_memory_errors(part, [view], "pass a smaller --size"):
         image = render(view, part, pipe, background, want_depth=False, want_visibility=False)["render"]
     path = Path(scene.model_path) / "videos" / f"ours_{scene.loaded_iter}" / f"{TOP}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ def render_top(
 def upright_axes(poses: Poses, known: Similarity | None) -> np.ndarray:
     """The axes (3,3) of the upright frame, by rows, in the world: x right, y down, z ahead.
 
-    As convert.py --orient found, else by the cameras' up, with the view that a page begins at looking ahead.
+    They come from convert.py --orient, else from the cameras' up and the view that an exported page begins at.
     """
     if known is not None and known.upright:
         return known.rotation
@@ -88,7 +88,7 @@ def upright_axes(poses: Poses, known: Similarity | None) -> np.ndarray:
 
 
 def _box(places: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Opposite corners (2,) of what to show of places (N,2) around cameras (M,2)."""
+    """Opposite corners (2,) of the box to show, of places (N,2) around cameras (M,2)."""
     most = np.quantile(places, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
     spread = _AROUND * float(np.linalg.norm(cameras - cameras.mean(0), axis=1).max())
     near = np.stack([cameras.min(0) - spread, cameras.max(0) + spread])
@@ -99,7 +99,7 @@ def _box(places: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _size(shown: np.ndarray, size: tuple[int, int] | None) -> tuple[tuple[int, int], float]:
-    """Width and height in pixels, and the world's units a pixel, to show a width and a height of the world (2,)."""
+    """Width and height in pixels, and world units a pixel, that show a width and a height of the world (2,)."""
     if size is None:
         size = tuple(max(2, round(_LONGEST * float(side / shown.max()))) for side in shown)
     return size, float((shown / np.array(size)).max())

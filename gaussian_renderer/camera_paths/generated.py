@@ -1,4 +1,4 @@
-"""Paths made from the training cameras: through them, around what they look at, and a spiral in front of it."""
+"""Paths made from the training cameras: through the cameras, around their focus, and a spiral in front of it."""
 
 import math
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import numpy as np
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 
 from gaussian_renderer.camera_paths.keyframes import Keyframe, TimedPath
-from gaussian_renderer.camera_paths.poses import Poses, facing, focus_point, keyframe, unit
+from gaussian_renderer.camera_paths.poses import Poses, focus_point, keyframe, look_along, unit
 from utils.system_utils import UserError
 
 SECONDS = 10.0  # of a path for which no other time is asked
@@ -44,7 +44,7 @@ class Interpolated:
                 "--path interpolate needs two training cameras with different poses, and the scene has "
                 "one; write keyframes into a file and pass that as --path"
             )
-        rows = np.column_stack([keys.positions, _same_side(keys.quaternions), keys.fov])
+        rows = np.column_stack([keys.positions, _align_signs(keys.quaternions), keys.fov])
         self._radius = turning_radius(keys)
         knots = np.concatenate([[0.0], np.cumsum(np.sqrt(self._steps(rows)))])
         # Tangents of the parabola through a row and its neighbours; at the ends, of the line.
@@ -76,10 +76,10 @@ class Interpolated:
 class Ellipse:
     """A closed path around the point nearest to all optical axes, looking at it (after Barron et al., Mip-NeRF 360).
 
-    It lies in the plane of the cameras (principal components), at their mean height over it, up is their mean up. If
-    that plane is not level, as of cameras on a wall or on a line, the level one takes its place. Half axes: those that
-    90 % of the cameras are within. Speed is constant. Where cameras leave a gap of over 120 degrees, it sways to and
-    fro on the arc that they cover, at their median distance.
+    The path lies in the plane of the cameras (principal components), at their mean height over it; up is their mean up.
+    If that plane is not level, as of cameras on a wall or on a line, a level one takes its place. 90 % of the cameras
+    are within the half axes. Speed is constant. If cameras leave a gap of over 120 degrees, the path sways to and fro
+    on the arc that they cover, at their median distance.
     """
 
     closed = True
@@ -104,14 +104,14 @@ class Ellipse:
     def at(self, seconds: float) -> Keyframe:
         """The pose at a moment between 0 and `seconds`."""
         offset = self._offset(seconds / self.seconds)
-        return keyframe(seconds, self.focus + offset, facing(-offset, self.up), self._fov)
+        return keyframe(seconds, self.focus + offset, look_along(-offset, self.up), self._fov)
 
 
 class Spiral:
     """A closed path of two turns about the mean camera, for cameras that face one way (after Mildenhall et al., LLFF).
 
-    Its radii, to the sides, up and along the axis, are those that 90 % of the cameras are within. It looks at the point
-    nearest to the optical axes, moved onto the mean axis, or straight ahead where they are parallel.
+    90 % of the cameras are within its radii, to the sides, up and along the axis. The path looks at the point nearest
+    to the optical axes, moved onto the mean axis, or straight ahead if the axes are parallel.
     """
 
     closed = True
@@ -126,7 +126,7 @@ class Spiral:
                 "interpolate"
             )
         self._up, self._fov = unit(poses.up), float(np.median(poses.fov))
-        self.middle, self._frame = poses.positions.mean(axis=0), facing(mean, self._up)
+        self.middle, self._frame = poses.positions.mean(axis=0), look_along(mean, self._up)
         self.radii = np.percentile(np.abs((poses.positions - self.middle) @ self._frame), 90, axis=0)
         focus = focus_point(poses)
         depth = 0.0 if focus is None else float((focus - self.middle) @ self._frame[:, 2])
@@ -137,7 +137,7 @@ class Spiral:
         angle = 4 * math.pi * seconds / self.seconds
         share = np.array([math.cos(angle), -math.sin(angle), -math.sin(angle / 2)])
         position = self.middle + self._frame @ (share * self.radii)
-        turn = self._frame if self.target is None else facing(self.target - position, self._up)
+        turn = self._frame if self.target is None else look_along(self.target - position, self._up)
         return keyframe(seconds, position, turn, self._fov)
 
 
@@ -149,9 +149,9 @@ GENERATED: dict[str, Callable[[Poses, float], TimedPath]] = {
 
 
 def turning_radius(poses: Poses) -> float:
-    """What a turn of one radian counts in `distances`: as much as walking the cameras' mean distance from their middle.
+    """The length that stands for a turn of one radian in `distances`: the cameras' mean distance from their middle.
 
-    1 where the cameras are all in one place.
+    1 if all cameras are in one place.
     """
     return poses.spread or 1.0
 
@@ -159,19 +159,19 @@ def turning_radius(poses: Poses) -> float:
 def visiting_order(poses: Poses) -> np.ndarray:
     """Indices of the poses in the order of a path.
 
-    The order given is kept, unless a tour is less than half as long: the nearest camera next, beginning at the first,
-    then improved by 2-opt (Croes 1958). So a walk stays as it was filmed, and photos in no order are not criss-crossed.
-    Of more than MOST poses, only MOST are taken, evenly.
+    The given order is kept, unless a tour is less than half as long: the nearest camera next, beginning at the first,
+    then improved by 2-opt (Croes 1958). So a filmed walk keeps its order, and unordered photos get a short path. Of
+    more than MOST poses, MOST are taken, evenly.
     """
     kept = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST)).round().astype(int))
     table = distances(poses[kept])
     given = np.arange(len(kept))
-    tour = _improved(_nearest_first(table), table)
+    tour = _two_opt(_nearest_first(table), table)
     return kept[tour if _length(tour, table) < _length(given, table) / 2 else given]
 
 
 def spread_along(poses: Poses, count: int) -> np.ndarray:
-    """Indices of at most `count` poses, spread evenly along the way through all of them, with both ends."""
+    """Indices of at most `count` poses, spread evenly along the path through all of them, with both ends."""
     if len(poses) <= count:
         return np.arange(len(poses))
     way = np.concatenate([[0.0], np.cumsum(np.diagonal(distances(poses), 1))])
@@ -181,7 +181,7 @@ def spread_along(poses: Poses, count: int) -> np.ndarray:
 
 
 def distances(poses: Poses) -> np.ndarray:
-    """How far poses are apart (N,N), in world units: distance moved plus `turning_radius` x radians turned."""
+    """Distances between poses (N,N), in world units: distance moved plus `turning_radius` x radians turned."""
     radius, quaternions = turning_radius(poses), poses.quaternions
     moved = np.stack([np.linalg.norm(poses.positions - position, axis=1) for position in poses.positions])
     return moved + radius * 2 * np.arccos(np.minimum(np.abs(quaternions @ quaternions.T), 1.0))
@@ -200,8 +200,8 @@ def _nearest_first(table: np.ndarray) -> np.ndarray:
     return np.array(order)
 
 
-def _improved(order: np.ndarray, table: np.ndarray) -> np.ndarray:
-    """Reverse parts of an open tour as long as that shortens it; its first stays the first."""
+def _two_opt(order: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """Reverse parts of an open tour as long as that shortens the tour (2-opt); the first pose stays first."""
     order = order.copy()
     for _ in range(_PASSES):
         before = _length(order, table)
@@ -219,15 +219,15 @@ def _improved(order: np.ndarray, table: np.ndarray) -> np.ndarray:
 
 
 def without_repeats(poses: Poses) -> Poses:
-    """The poses but for those that equal the one before them, within rounding."""
+    """Leave out poses that equal the one before, within rounding."""
     radius = turning_radius(poses)
-    rows = np.column_stack([poses.positions, _same_side(poses.quaternions) * radius])
+    rows = np.column_stack([poses.positions, _align_signs(poses.quaternions) * radius])
     steps = np.linalg.norm(np.diff(rows, axis=0), axis=1)
     return poses[np.concatenate([[True], steps > 1e-5 * radius])]
 
 
-def _same_side(quaternions: np.ndarray) -> np.ndarray:
-    """The quaternions, negated where the one before is nearer to that."""
+def _align_signs(quaternions: np.ndarray) -> np.ndarray:
+    """Negate a quaternion where that is nearer to the one before."""
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return quaternions * np.concatenate([[1.0], np.cumprod(flips)])[:, None]
 
@@ -244,7 +244,7 @@ def plane_normal(poses: Poses) -> np.ndarray:
 
 
 def ring(poses: Poses, focus: np.ndarray, normal: np.ndarray) -> Callable[[float], np.ndarray]:
-    """The way of `Ellipse` about a normal (3,): from a share of it, 0 to 1, the camera's place, less the focus (3,)."""
+    """The path of `Ellipse` about a normal (3,): maps a share of it, 0 to 1, to the offset (3,) from the focus."""
     offsets = poses.positions - focus
     height = float((offsets @ normal).mean())
     flat = offsets - (offsets @ normal)[:, None] * normal
@@ -279,7 +279,7 @@ def _on(radius: np.ndarray, angle: float, plane: np.ndarray) -> np.ndarray:
 
 
 def _even_angles(radius: np.ndarray) -> PchipInterpolator:
-    """The angle of an ellipse with half axes (2,) after a share of its length."""
+    """Interpolate the angle on an ellipse with half axes (2,) from a share of its length."""
     angles = np.linspace(0, 2 * math.pi, _SAMPLES + 1)
     steps = np.diff(np.column_stack([radius[0] * np.cos(angles), radius[1] * np.sin(angles)]), axis=0)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(steps, axis=1))])

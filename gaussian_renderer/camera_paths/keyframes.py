@@ -39,7 +39,7 @@ class CameraPath:
 
     @property
     def seconds(self) -> float:
-        """How long the path takes."""
+        """Duration of the path."""
         return self.keyframes[-1].seconds
 
     def write(self, path: Path) -> None:
@@ -48,7 +48,7 @@ class CameraPath:
 
 
 class TimedPath(Protocol):
-    """A camera in motion. seconds: how long. closed: whether it ends in the pose that it began with."""
+    """A camera in motion. seconds: duration. closed: whether the last pose is the first one."""
 
     seconds: float
     closed: bool
@@ -60,8 +60,7 @@ class TimedPath(Protocol):
 def frame_count(path: TimedPath, fps: int) -> int:
     """Frames of a video: round(seconds * fps), and one more for the end of a path that is not closed.
 
-    Frame i shows the moment i / fps. A closed path is shown without its end, which is its beginning, so that the video
-    can be played in a loop.
+    Frame i shows the moment i / fps. A closed path is shown without its end, so that the video can be played in a loop.
     """
     return max(1, round(path.seconds * fps) + (not path.closed))
 
@@ -151,7 +150,7 @@ def _keyframe(entry: Any, where: str) -> Keyframe:
 
 
 def _numbers(entry: dict, name: str, count: int | None, where: str) -> tuple[float, ...]:
-    """The finite numbers of an entry: `count` in a list, or one that stands alone."""
+    """Return the finite numbers of an entry: a list of `count`, or with None a single number."""
     value = entry.get(name)
     values = value if count else [value]
     what = f"{count} numbers" if count else "a number"

@@ -69,20 +69,20 @@ def poses_of(cameras: Sequence[Camera]) -> Poses:
     views = np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
     positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
     turns = _rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
-    return Poses(positions, turns, np.degrees([opening(camera) for camera in cameras]))
+    return Poses(positions, turns, np.degrees([vertical_fov(camera) for camera in cameras]))
 
 
-def opening(camera: Camera) -> float:
-    """Vertical opening angle, radians, of a pinhole view in a camera's place; of a wide lens's, at most WIDEST."""
+def vertical_fov(camera: Camera) -> float:
+    """Vertical opening angle, radians, of a pinhole view that stands for a camera; at most WIDEST for a wide lens."""
     lens = getattr(camera, "lens", None)
     wide = lens is not None and lens.chart != "perspective"
     return min(float(camera.FoVy), np.radians(WIDEST)) if wide else float(camera.FoVy)
 
 
 def ray_through(camera: Camera, x: float, y: float) -> np.ndarray:
-    """The direction (3,) in the world of a place in a camera's photo: pixels from the left and the top of its file.
+    """The direction (3,) in the world of a pixel of a camera's photo, counted from the left and the top of the file.
 
-    It has no certain length, and is 0 where the lens shows nothing.
+    The length is arbitrary, and 0 where the lens shows nothing.
     """
     size = np.array([camera.image_width, camera.image_height])
     share = np.array([x, y]) / getattr(camera, "photo_size", size)
@@ -95,14 +95,14 @@ def ray_through(camera: Camera, x: float, y: float) -> np.ndarray:
 
 
 def unit(vector: np.ndarray) -> np.ndarray:
-    """A vector (3,) at length 1."""
+    """Scale a vector (3,) to length 1."""
     return vector / np.linalg.norm(vector)
 
 
-def facing(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
+def look_along(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
     """The turn (3,3), from camera to world axes, of a camera that looks along `forward`, its head towards `up`.
 
-    The two directions (3,) need no length; they must not be parallel.
+    The two directions (3,) may have any length; they must not be parallel.
     """
     z = unit(forward)
     x = unit(np.cross(-up, z))
@@ -110,7 +110,7 @@ def facing(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 
 def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
-    """A pose with a turn (3,3) as a Keyframe."""
+    """Make a Keyframe of a pose with a turn (3,3)."""
     wxyz = _rotations(turn).as_quat(scalar_first=True)
     return Keyframe(seconds, tuple(position.tolist()), tuple(wxyz.tolist()), float(fov))
 

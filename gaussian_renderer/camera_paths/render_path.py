@@ -1,4 +1,4 @@
-"""Videos of camera paths: the options of render.py for them, the request that they make, and its rendering."""
+"""Videos of camera paths: options of render.py, the request that they describe, and its rendering."""
 
 import argparse
 import math
@@ -21,7 +21,7 @@ from gaussian_renderer.camera_paths.keyframes import (
 )
 from gaussian_renderer.camera_paths.video import find_ffmpeg, write_video
 from gaussian_renderer.free_view import free_view
-from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer.memory_errors import explain_memory_errors
 from groundwork.files.image_files import remove_leftovers, save_png, to_bytes
 from groundwork.host.progress import Bar
 from scene.cameras import Camera
@@ -44,7 +44,7 @@ _WITHOUT_PATH = ("depth", "alpha")
 
 
 def add_path_options(parser: argparse.ArgumentParser) -> None:
-    """Add --path and what goes with it to a parser."""
+    """Add --path and the options that go with it to a parser."""
     group = parser.add_argument_group("Camera path")
     kinds = "interpolate, ellipse, spiral, or a JSON file of keyframes, or a picture from above: top"
     group.add_argument("--path", metavar="PATH", help=f"write a video along {kinds}; no views (default: none)")
@@ -59,8 +59,11 @@ def add_path_options(parser: argparse.ArgumentParser) -> None:
 class PathRequest:
     """A video to make, or a picture from above.
 
-    name: of its files. make: the path of the training cameras' poses, None: from above. fps: frames a second.
-    size: width and height, even, None: those of the first training camera, made even. frames: whether to write PNGs.
+    name: name of its files.
+    make: makes the path from the training cameras' poses; None: a picture from above.
+    fps: frames a second.
+    size: width and height, even; None: the first training camera's, made even.
+    frames: whether to write PNGs.
     """
 
     name: str
@@ -71,7 +74,7 @@ class PathRequest:
 
 
 def path_request(args: argparse.Namespace) -> PathRequest | None:
-    """The request of a command line with the options of `add_path_options`, None without --path.
+    """Make the request of a command line with the options of `add_path_options`; None without --path.
 
     Reads the keyframe file and looks for ffmpeg. UserError for options that do not go together, a wrong value, a wrong
     file or a missing ffmpeg.
@@ -108,9 +111,11 @@ def _checked_size(width: int, height: int) -> tuple[int, int]:
 
 
 def path_maker(path: str, seconds: float | None = None, others: Sequence[str] = ()) -> Callable[["Poses"], TimedPath]:
-    """What makes the path that --path names, from the training cameras' poses. UserError for a wrong one.
+    """A function that makes the path of --path from the training cameras' poses. UserError for a wrong value.
 
-    seconds: how long a generated path takes; None: 10. others: further names that the command takes.
+    path: value of --path.
+    seconds: duration of a generated path; None: 10.
+    others: further names that the command takes.
     """
     from gaussian_renderer.camera_paths.generated import GENERATED, SECONDS  # SciPy takes a while to import
 
@@ -161,7 +166,7 @@ def render_path(
         for number in Bar(range(count), desc=f"Rendering {request.name}", unit="frame"):
             pose = path.at(frame_moment(path, request.fps, number))
             view = free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, background.device)
-            with memory_errors_explained(scene.gaussians, [view], remedy):
+            with explain_memory_errors(scene.gaussians, [view], remedy):
                 drawn = render(view, scene.gaussians, pipe, background, want_depth=False, want_visibility=False)
                 pixels = to_bytes(drawn["render"])
             yield pixels.numpy()
@@ -175,6 +180,6 @@ def render_path(
 
 
 def even_size(camera: Camera) -> tuple[int, int]:
-    """Width and height of a view, odd ones a pixel smaller, as yuv420p needs even ones."""
+    """Width and height of a view, odd ones a pixel smaller: yuv420p needs even ones."""
     width, height = int(camera.image_width), int(camera.image_height)
     return max(2, width - width % 2), max(2, height - height % 2)

@@ -1,4 +1,4 @@
-"""Where an exported page and the viewer begin: the camera, and how much of its photo a window shows."""
+"""The first camera of exported pages and of the viewer, and the part of its photo that a window shows."""
 
 import math
 
@@ -12,7 +12,7 @@ _FARTHER = 1.5  # of the usual distance: from there a view shows more of the mid
 
 
 def best_start(poses: Poses) -> int:
-    """The camera that looks most straight at what all look at, from a usual distance or somewhat farther away.
+    """Index of the camera that looks most directly at the common focus, from a usual distance or somewhat farther.
 
     The first of equals. One radian off the axis counts as much as being nearer, or too far, by a factor of e.
     """
@@ -27,11 +27,13 @@ def best_start(poses: Poses) -> int:
     return int(np.argmax(scores <= scores.min() + _ALIKE))
 
 
-def narrowed(fov: float, photo: float, window: float) -> float:
-    """The vertical opening angle, radians, at which a photo fills a window, and LEAST of its sides is shown.
+def narrow_fov(fov: float, photo: float, window: float) -> float:
+    """The vertical opening angle, radians, at which a photo fills a window, and LEAST of its width or height is shown.
 
-    The window shows MOST photos' heights at most. fov: of the photo. photo, window: width over height. page.js has the
-    same formula.
+    The window shows at most MOST times the photo's height. page.js has the same formula.
+
+    fov: the photo's vertical opening angle, radians.
+    photo, window: width over height.
     """
     share = photo / window
     heights = max(share, LEAST) if share < 1 else min(max(1.0, LEAST * share), MOST)

@@ -73,7 +73,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: in
 
 
 def _accepted(act: Callable[..., object], *values: object) -> bool:
-    """Whether ffmpeg takes its input: it may have ended."""
+    """Call `act`, which writes to ffmpeg; False if ffmpeg has ended."""
     try:
         act(*values)
     except OSError:

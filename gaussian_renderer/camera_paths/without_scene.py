@@ -1,6 +1,6 @@
-"""Cameras of a model whose scene is not at hand: those that its folder records, or a circle around it.
+"""Cameras of a model whose scene is missing: those recorded in its folder, or cameras on a circle around it.
 
-And whether a scene that is at hand still has those cameras.
+`have_moved` compares recorded cameras with a scene's.
 """
 
 import argparse
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_renderer.camera_paths.poses import facing, poses_of
+from gaussian_renderer.camera_paths.poses import look_along, poses_of
 from groundwork.files.json_files import read_json
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -36,7 +36,7 @@ _MOVED = 1e-3  # of the mean distance of cameras from their middle; other progra
 
 @dataclass
 class WithoutScene:
-    """What needs no photos takes of a scene: cameras that have none. loaded_iter: the iteration, or a name."""
+    """A stand-in for a scene whose cameras have no photos. loaded_iter: the iteration, or a name."""
 
     gaussians: GaussianModel
     model_path: str
@@ -52,8 +52,8 @@ class WithoutScene:
         return list(self.test)
 
 
-def record_of(options: argparse.Namespace) -> Path | None:
-    """The cameras.json of a model folder whose scene is gone; None: the scene is there, or nothing stands in for it.
+def recorded_cameras_file(options: argparse.Namespace) -> Path | None:
+    """The cameras.json of a model folder whose scene is missing; None if the scene is there, or the file is not.
 
     options: the model options.
     """
@@ -65,8 +65,8 @@ def record_of(options: argparse.Namespace) -> Path | None:
 
 
 def saved_scene(options: argparse.Namespace, iteration: int, sh_degree: int | None = None) -> Scene | WithoutScene:
-    """The model of a folder with its scene, as `load_saved`, or where that is gone with the cameras of `record_of`."""
-    if (record := record_of(options)) is None:
+    """Load the model of a folder with its scene (`load_saved`), or with the cameras of `recorded_cameras_file`."""
+    if (record := recorded_cameras_file(options)) is None:
         return load_saved(options, iteration, sh_degree)
     iteration, path = find_save(options.model_path, iteration)
     gaussians = read_model(path, sh_degree)
@@ -75,14 +75,14 @@ def saved_scene(options: argparse.Namespace, iteration: int, sh_degree: int | No
     return WithoutScene(gaussians, options.model_path, iteration, recorded_cameras(record, options.resolution))
 
 
-def circle(means: np.ndarray) -> list[Camera]:
-    """Views that look from a circle at the middle of positions (N, 3): their median. Up is -y, as of most models."""
+def circle_cameras(means: np.ndarray) -> list[Camera]:
+    """Make views on a circle that look at the median of positions (N, 3). Up is -y, as in most models."""
     middle = np.median(means, axis=0).astype(np.float64) if len(means) else np.zeros(3)
     radius = _FAR * float(np.median(np.linalg.norm(means - middle, axis=1))) if len(means) else 0.0
     infos = []
     for number, angle in enumerate(2 * np.pi * np.arange(COUNT) / COUNT):
         away = np.array([np.sin(angle), -_HIGH, -np.cos(angle)])
-        turn = facing(-away, np.array([0.0, -1.0, 0.0]))
+        turn = look_along(-away, np.array([0.0, -1.0, 0.0]))
         infos.append(_info(number, f"around {number}", turn, middle + (radius or 1.0) * away, *SIZE, _FOCAL * SIZE[0]))
     return _cameras(infos)
 
@@ -99,7 +99,7 @@ def recorded_cameras(path: Path, resolution: int = 1) -> list[Camera]:
 
 
 def warn_if_moved(model: str | os.PathLike, cameras: Sequence[Camera]) -> None:
-    """Print a warning where `have_moved`."""
+    """Print a warning if `have_moved`."""
     if have_moved(Path(model), cameras):
         print(
             f"warning: the scene's poses are not those that {model} was trained with, so the model does not fit its "
@@ -109,9 +109,9 @@ def warn_if_moved(model: str | os.PathLike, cameras: Sequence[Camera]) -> None:
 
 
 def have_moved(folder: Path, cameras: Sequence[Camera]) -> bool:
-    """Whether cameras are elsewhere than a model folder's cameras.json has those of their names.
+    """Tell whether cameras are at other places than the same names in a model folder's cameras.json.
 
-    No if it has none, or the training corrected poses.
+    False if the file has none of them, or if the training corrected poses.
     """
     if (folder / _CORRECTED).is_file():
         return False

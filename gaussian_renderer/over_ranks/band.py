@@ -1,4 +1,4 @@
-"""A rank's band of a view: forward to the image, and back to the gradient rows of the rank's Gaussians."""
+"""A rank's band of a view: forward to the image, and backward to the gradient rows of the rank's Gaussians."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from groundwork.ranks.ranks import Ranks
 
 
 class Band(NamedTuple):
-    """What a loss by bands has to know (`photometric_loss_by_bands` of fused_ssim)."""
+    """The rows of a band, and a sum over ranks, for a loss by bands (`photometric_loss_by_bands` of fused_ssim)."""
 
     rows: tuple[int, int]  # of pixels, first and end
     add: Callable[[Tensor], Tensor]  # sums over all bands
@@ -23,11 +23,11 @@ class Band(NamedTuple):
 
 @dataclass(slots=True)
 class View:
-    """A rank's band of a view, and what the way back needs. Planes are of the size of the whole image."""
+    """A rank's band of a view, and the tensors for its backward. Planes have the size of the whole image."""
 
     ranks: Ranks
     bands: Bands
-    color: Tensor  # (3, H, W), right in the rows of the band, unless `whole_image` or `surroundings` says more
+    color: Tensor  # (3, H, W), right in the rows of the band, unless `gather_image` or `exchange_halo` says more
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
     radii: Tensor  # (N,) of the rank's own Gaussians
     splats: Tensor  # (N, 10)
@@ -39,12 +39,12 @@ class View:
 
     @property
     def last(self) -> Tensor:
-        """(H, W), where lists end in the rows of the band."""
+        """The ends of lists (H, W), valid in the rows of the band."""
         return self.drawing.last
 
     @property
     def band(self) -> Band:
-        return Band(self.bands.pixels(self.ranks.rank), self.ranks.added)
+        return Band(self.bands.pixels(self.ranks.rank), self.ranks.all_reduce_sum)
 
 
 def draw_view(
@@ -56,10 +56,11 @@ def draw_view(
     find: Callable[..., Bands] | None = None,
     awake: Tensor | None = None,
 ) -> View:
-    """Render the rank's band of a view with the Gaussians of all ranks, with the bits of one process.
+    """Render the rank's band of a view with the Gaussians of all ranks, to the same bits as one process.
 
-    scene: the rasterizer's arguments with the rank's own Gaussians. find: takes the place of `find_bands`. awake: of
-    the rank's own blocks (scene/sleeping.py), None: all are.
+    scene: the rasterizer's arguments with the rank's own Gaussians.
+    find: takes the place of `find_bands`.
+    awake: which of the rank's own blocks are awake (scene/sleeping.py), None: all.
     """
     height, width = scene.size
     own, depths, rects, tile_counts, radii = OPERATORS.project(*scene, awake)
@@ -78,19 +79,19 @@ def draw_view(
     return View(ranks, bands, color, inverse_depth, radii, own, tile_counts, sent, inside, drawing, background)
 
 
-def whole_image(view: View) -> View:
-    """Give every rank all rows of the image, and of the inverse depth if it is wanted. Returns the view."""
+def gather_image(view: View) -> View:
+    """Give every rank all rows of the image, and of the inverse depth if wanted. Returns the view."""
     ranks, bands = view.ranks, view.bands
     rows = [bands.pixels(rank) for rank in range(ranks.size)]
     first, end = rows[ranks.rank]
     own = torch.cat((view.color, view.inverse_depth))[:, first:end].transpose(0, 1)
-    planes = ranks.gather(own, [end - first for first, end in rows]).transpose(0, 1).contiguous()
+    planes = ranks.all_gather_rows(own, [end - first for first, end in rows]).transpose(0, 1).contiguous()
     view.color, view.inverse_depth = planes[:3], planes[3:]
     return view
 
 
-def surroundings(view: View) -> View:
-    """Give every rank the rows of colour around its band that its loss depends on (REACH). Returns the view."""
+def exchange_halo(view: View) -> View:
+    """Give every rank the rows of colour around its band that its loss reads (REACH). Returns the view."""
     given, taken = view.bands.halo
     rows = view.color.transpose(0, 1).index_select(0, given.indices)
     received = view.ranks.send(rows, given.sizes, taken.sizes)[0]
@@ -101,9 +102,9 @@ def surroundings(view: View) -> View:
 def gradient_rows(
     view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gradient rows of the rank's own Gaussians, and how many each has, from the gradients of the image.
+    """Compute gradient rows of the rank's own Gaussians, and their number for each, from gradients of the image.
 
-    gradients: of colour, transmittance and inverse depth, (., H, W), of which the rows of the band count.
+    gradients: of colour, transmittance and inverse depth, (., H, W); only the rows of the band are read.
     """
     rows, counts = OPERATORS.blend_rows(view.drawing.kept(view.background), *gradients, absolute)
     return return_rows(view.ranks, view.sent, len(view.radii), rows, counts, view.inside)
@@ -114,15 +115,17 @@ def camera_gradient(
 ) -> Tensor:
     """Gradients of the camera's numbers (diff_gaussian_rasterization/camera.py) by the Gaussians of all ranks, float64.
 
-    They have the bits of one process where each rank has whole blocks of rows (Shards). source: splats, tile counts,
-    and what `gradient_rows` returns. blocks: how many each rank has, if this is known. Every rank must call it.
+    If each rank has whole blocks of rows (Shards), the bits are those of one process. Every rank must call it.
+
+    source: splats, tile counts, and the result of `gradient_rows`.
+    blocks: number of blocks of each rank, if known.
     """
     own = OPERATORS.camera_vjp(*scene, source, absolute)
-    return OPERATORS.sum_blocks(ranks.gather(own, blocks))
+    return OPERATORS.sum_blocks(ranks.all_gather_rows(own, blocks))
 
 
 def decisive_in(view: View) -> Tensor:
-    """The rank's own Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
+    """Mark the rank's Gaussians that the image depends on (`decisive` of diff_gaussian_rasterization): (N,) bool."""
     splats, instances, ranges, sent = view.drawing.splats, view.drawing.instances, view.drawing.ranges, view.sent
     mask = OPERATORS.decisive(splats, instances, ranges, view.last)
     by_band, _ = view.ranks.send(mask, sent.received, sent.sizes)

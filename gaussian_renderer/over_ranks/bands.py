@@ -22,10 +22,12 @@ _NOWHERE = 1 << 30  # a row of tiles that no rectangle reaches
 
 
 class Bands:
-    """The bands of all ranks, the same on every rank. They decide no bit of a result.
+    """The bands of all ranks, the same on every rank. Results do not depend on them.
 
-    borders: rows of tiles where a band begins, and where the last one ends: size + 1 numbers. height: of the image,
-    pixels. device: of the tensors. rank: this one.
+    borders: the first row of tiles of each band, and the end of the last one: size + 1 numbers.
+    height: height of the image, pixels.
+    device: device of the tensors.
+    rank: number of this rank.
     """
 
     def __init__(self, borders: Sequence[int], height: int, rank: int, device: torch.device) -> None:
@@ -38,19 +40,19 @@ class Bands:
         return range(*self.borders[self._rank : self._rank + 2])
 
     def pixels(self, rank: int, reach: int = 0) -> tuple[int, int]:
-        """The rows of pixels of a band, first and end, and `reach` more on either side, unless it is empty."""
+        """The first and the end row of pixels of a band, with `reach` more on either side unless the band is empty."""
         first, end = (min(TILE * border, self.height) for border in self.borders[rank : rank + 2])
         return (max(first - reach, 0), min(end + reach, self.height)) if first < end else (first, end)
 
     @cached_property
     def limits(self) -> Tensor:
-        """Rows of tiles where each band begins and ends: (2, size) int32; an empty band is nowhere."""
+        """First and end row of tiles of each band: (2, size) int32; an empty band contains no row."""
         pairs = [(a, b) if a < b else (_NOWHERE, -1) for a, b in zip(self.borders, self.borders[1:], strict=False)]
         return torch.tensor(pairs, dtype=torch.int32).T.contiguous().to(self._device)
 
     @cached_property
     def halo(self) -> tuple["Rows", "Rows"]:
-        """The rows of pixels that other ranks' losses need of this band, and that this rank's loss needs of theirs."""
+        """The rows of pixels that other ranks' losses read of this band, and this rank's loss of theirs."""
         own, wide = self.pixels(self._rank), self.pixels(self._rank, REACH)
         others = [rank for rank in range(len(self.borders) - 1) if rank != self._rank]
         given = {rank: _common(own, self.pixels(rank, REACH)) for rank in others}
@@ -59,7 +61,7 @@ class Bands:
 
 
 class Rows:
-    """Rows of pixels, which belong to the ranks 0, 1 and so on. indices: (n,) on a device. sizes: how many by rank."""
+    """Rows of pixels for ranks 0, 1 and so on. indices: (n,), on a device. sizes: number of rows for each rank."""
 
     def __init__(self, parts: dict[int, range], device: torch.device) -> None:
         self.sizes = [len(parts[rank]) for rank in range(len(parts))]
@@ -68,20 +70,22 @@ class Rows:
 
 
 def _common(one: tuple[int, int], other: tuple[int, int]) -> range:
-    """Rows that are in both."""
+    """Intersect two ranges of rows."""
     return range(max(one[0], other[0]), min(one[1], other[1]))
 
 
 def tile_rows(height: int) -> int:
-    """Rows of tiles of an image of so many pixels."""
+    """Number of rows of tiles of an image, `height` in pixels."""
     return -(-height // TILE)
 
 
-def row_widths(rects: Tensor, tile_counts: Tensor, height: int) -> Tensor:
-    """By how much the sum of widths changes at each row of tiles, and below the last one: (rows + 1,) int64.
+def width_changes(rects: Tensor, tile_counts: Tensor, height: int) -> Tensor:
+    """The change of the summed widths of splats at each row of tiles, and below the last one: (rows + 1,) int64.
 
-    rects: (N, 4), the rectangles of splats, which count where tile_counts (N,) do. Of many splats every k-th one
-    stands for k: all would add to the same few numbers, one after the other.
+    Of many splats every k-th one stands for k: all would add to the same few numbers, one after the other.
+
+    rects: (N, 4), the splats' rectangles.
+    tile_counts: (N,), 0 for a splat that does not count.
     """
     every = -(-len(rects) // _SAMPLE) or 1
     rows = tile_rows(height)
@@ -92,8 +96,8 @@ def row_widths(rects: Tensor, tile_counts: Tensor, height: int) -> Tensor:
     return steps.index_add_(0, torch.cat((top, bottom)).clamp_(0, rows), torch.cat((wide, -wide)))
 
 
-def row_processed(last: Tensor, rows: range) -> Tensor:
-    """How many instances the backward reads in each row of tiles: (all rows + 1,) int64, 0 but in `rows`.
+def processed_by_row(last: Tensor, rows: range) -> Tensor:
+    """Number of instances that the backward reads in each row of tiles: (all rows + 1,) int64, 0 outside `rows`.
 
     last: (H, W), the position behind the last instance of a pixel in its tile's list.
     """
@@ -110,14 +114,15 @@ def row_processed(last: Tensor, rows: range) -> Tensor:
 def find_bands(
     ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int, processed: Tensor | None = None
 ) -> Bands:
-    """Bands of about equal loads. rects: (N, 4), of the rank's own Gaussians, which count where tile_counts (N,) do.
+    """Find bands of about equal work. A splat costs the width of its rectangle in each of its rows.
 
-    A splat is as much work as its rectangle is wide, in each of its rows. processed: `row_processed` of the rank's
-    band in an earlier visit; given by all ranks or by none.
+    rects: (N, 4), rectangles of the rank's own Gaussians.
+    tile_counts: (N,), 0 for a Gaussian that does not count.
+    processed: `processed_by_row` of the rank's band in an earlier visit; given by all ranks or by none.
     """
-    widths = row_widths(rects, tile_counts, height)
+    widths = width_changes(rects, tile_counts, height)
     loads = torch.stack((widths, torch.zeros_like(widths) if processed is None else processed))
-    widths, processed = ranks.table(loads).sum(0).cpu()
+    widths, processed = ranks.all_gather(loads).sum(0).cpu()
     total = widths.cumsum(0)[:-1] + _PROCESSED_COST * processed[:-1] + _TILE_COST * tile_rows(width)
     ends = total.cumsum(0)
     shares = torch.arange(1, ranks.size) * int(ends[-1]) // ranks.size
@@ -133,8 +138,8 @@ class _Visits:
     processed: Tensor | None = None  # in the last visit before bands are found anew
 
 
-class KnownBands:
-    """Bands of views that come again: found anew after some visits only, as they follow what changes slowly.
+class CachedBands:
+    """Bands kept for later visits of a view; work changes slowly, so they are found again only after some visits.
 
     All ranks have to ask for the same views in the same order.
     """
@@ -143,7 +148,7 @@ class KnownBands:
         self._kept: dict[Hashable, _Visits] = {}
 
     def find(self, view: Hashable, ranks: Ranks, rects: Tensor, tile_counts: Tensor, height: int, width: int) -> Bands:
-        """`find_bands`, or the bands of an earlier visit of the view."""
+        """Return the bands of an earlier visit of the view, or find them (`find_bands`)."""
         key = view, height, width
         kept = self._kept.get(key)
         if kept is None or kept.count >= _VISITS:
@@ -152,8 +157,8 @@ class KnownBands:
         kept.count += 1
         return kept.bands
 
-    def drawn(self, view: Hashable, last: Tensor) -> None:
-        """Note what the last visit before bands are found anew has processed. last: as of `row_processed`."""
+    def note_processed(self, view: Hashable, last: Tensor) -> None:
+        """Note the work of the last visit before bands are found again. last: as for `processed_by_row`."""
         kept = self._kept[(view, *last.shape)]
         if kept.count == _VISITS:
-            kept.processed = row_processed(last, kept.bands.own)
+            kept.processed = processed_by_row(last, kept.bands.own)

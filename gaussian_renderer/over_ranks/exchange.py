@@ -1,7 +1,6 @@
-"""Exchange of what ranks need of each other in a view: splats for the bands that they reach, gradient rows back.
+"""Exchange between ranks in a view: splats to the bands that they reach, gradient rows back.
 
-What a GPU computes is read by the host, which then waits, as rarely as can be: once to learn how many records all ranks
-send, and once how many gradient rows.
+The host waits for a GPU only twice: to read the numbers of records that ranks send, and of gradient rows.
 """
 
 from collections.abc import Sequence
@@ -22,9 +21,9 @@ _EVEN = 4
 
 @dataclass(slots=True)
 class Sent:
-    """Which of a rank's own Gaussians each rank got, as a record, and how many records this one got from each.
+    """The Gaussians that a rank has sent to each rank, as records, and the number of records that it received.
 
-    The last records for a rank, at least one, are empty: they are of no Gaussian, but of number N.
+    The last records for a rank, at least one, are empty and have the Gaussian number N.
     """
 
     gaussians: Tensor  # (n,), ascending for each rank, rank after rank
@@ -42,7 +41,7 @@ def send_splats(ranks: Ranks, bands: Bands, splats: tuple[Tensor, ...]) -> tuple
     counts = OPERATORS.list_records(*reach)[0]
     empty = _EVEN - counts[:-1].sum(1).remainder(_EVEN)
     counts = torch.cat((counts, torch.cat((empty, empty.sum()[None])).int()[:, None]), 1)
-    every = ranks.agree(counts[:-1].sum(1))
+    every = ranks.all_gather_ints(counts[:-1].sum(1))
     sizes, received = every[ranks.rank], [numbers[ranks.rank] for numbers in every]
     _, gaussians, places, *records = OPERATORS.list_records(*reach, counts, *splats[:2], sum(sizes))
     # One message each, so that nothing has to be taken apart: a copy of all takes longer than three more messages.
@@ -55,10 +54,12 @@ def return_rows(
 ) -> tuple[Tensor, Tensor]:
     """Send gradient rows back; receive those of the rank's own `count` Gaussians from all ranks.
 
-    rows: (R, V), those of a record side by side; counts (n,) int32: of each record here; inside (n,): whether the
-    record reaches no other band, so that no other rank has rows of its Gaussian. Returns the same for the rank's
-    Gaussians: the rows of each in the order of ranks, which is that of its tiles; or one row, their sum, where the
-    record of a Gaussian lies in one band.
+    rows: (R, V), the rows of a record side by side.
+    counts: (n,) int32, number of rows of each record here.
+    inside: (n,), whether the record reaches no other band, so that no other rank has rows of its Gaussian.
+
+    Returns rows and counts for the rank's Gaussians: the rows of each in the order of ranks, which is the order of its
+    tiles; or one row, their sum, where the record of a Gaussian lies in one band.
     """
     kept = torch.where(inside, counts.clamp_max(1), counts)
     arrived, own, length = _send_back(ranks, sent, rows, counts, kept)
@@ -68,7 +69,7 @@ def return_rows(
 
 
 def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Tensor) -> tuple[Tensor, Tensor, int]:
-    """Send what is kept of the rows of each record (`sum_runs` of the rasterizer), and receive those of this rank.
+    """Send `kept` of the rows of each record (`sum_runs` of the rasterizer), and receive those of this rank.
 
     Returns the rows from all ranks, by rank; the number of each record that a rank got (int32); and the number of rows
     without those of empty records. Where the rows for a rank are odd in number, its last empty record has one of zeros,
@@ -87,5 +88,5 @@ def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Ten
 
 
 def _sums(counts: Tensor, sizes: Sequence[int]) -> Tensor:
-    """Sums of so many counts each, one part after the other: (parts,) int64."""
+    """Sum consecutive parts of counts, of `sizes` each: (parts,) int64."""
     return torch.stack([part.sum() for part in counts.split(sizes)])

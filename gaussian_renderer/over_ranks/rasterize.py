@@ -12,7 +12,7 @@ from diff_gaussian_rasterization.ops import Rasterized, gradients_of
 from diff_gaussian_rasterization.scene import Scene, scene_arguments
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.band import camera_gradient, draw_view, gradient_rows, whole_image
+from gaussian_renderer.over_ranks.band import camera_gradient, draw_view, gather_image, gradient_rows
 from groundwork.ranks.ranks import Ranks
 
 
@@ -28,10 +28,11 @@ def rasterize_over(
     want_absolute_gradient: bool = False,
     **others: Tensor | None,
 ) -> Rasterized:
-    """Render the Gaussians of all ranks. Arguments as of `rasterize`, each rank with its own Gaussians.
+    """Render the Gaussians of all ranks. Arguments as for `rasterize`, each rank with its own Gaussians.
 
-    Every rank calls it for the same view and gets the whole image, and `radii` of its own Gaussians; backward needs the
-    same gradient of the image on every rank. Tensors of the settings get gradients if they require them on every rank.
+    Every rank calls this function for the same view and gets the whole image, and `radii` of its own Gaussians;
+    backward needs the same gradient of the image on every rank. Tensors of the settings get gradients if they require
+    them on every rank.
     """
     gaussians = Gaussians(means, opacities, **others)
     scene = scene_arguments(gaussians, settings, raw)
@@ -44,14 +45,14 @@ def rasterize_over(
 
 
 class _OverRanks(torch.autograd.Function):
-    """Takes the ranks, what is no tensor to train, the camera's numbers or None, means2d, and the Gaussians."""
+    """Autograd of `rasterize_over`. Inputs: ranks, constants, the camera's numbers or None, means2d, the Gaussians."""
 
     @staticmethod
     def forward(
         ctx: Any, ranks: Ranks, options: tuple, numbers: Tensor | None, _: Tensor, *gaussians: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
         camera, background, want_depth, train, absolute = options
-        view = whole_image(draw_view(ranks, Scene(*gaussians, *camera), background, want_depth, train))
+        view = gather_image(draw_view(ranks, Scene(*gaussians, *camera), background, want_depth, train))
         ctx.mark_non_differentiable(view.radii)
         ctx.set_materialize_grads(False)
         if train:

@@ -1,4 +1,4 @@
-"""Views of a model that is divided among ranks, for the renderer, which need not ask how many there are."""
+"""Views of a model that may be divided among ranks, so that the renderer need not distinguish."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -14,11 +14,11 @@ from gaussian_renderer.over_ranks.band import (
     camera_gradient,
     decisive_in,
     draw_view,
+    exchange_halo,
+    gather_image,
     gradient_rows,
-    surroundings,
-    whole_image,
 )
-from gaussian_renderer.over_ranks.bands import KnownBands as KnownBands
+from gaussian_renderer.over_ranks.bands import CachedBands as CachedBands
 from gaussian_renderer.over_ranks.rasterize import rasterize_over
 from groundwork.ranks.ranks import ALONE, Ranks
 from scene.cameras import Camera, MiniCam
@@ -39,7 +39,7 @@ def _ranks_of(model: Any) -> Ranks:
 
 
 def rasterizer_of(model: Any) -> Callable[..., Rasterized]:
-    """`rasterize`, or that of the ranks among which a model is divided."""
+    """Return `rasterize`, or `rasterize_over` bound to the ranks among which a model is divided."""
     return partial(rasterize_over, ranks) if (ranks := _ranks_of(model)).several else rasterize
 
 
@@ -49,25 +49,25 @@ def draw_divided(
     background: Tensor,
     want_depth: bool,
     by_bands: bool,
-    bands: KnownBands | None,
+    bands: CachedBands | None,
     camera: Camera | MiniCam,
     awake: Tensor | None = None,
 ) -> "DividedDrawn | None":
-    """`draw` of the renderer for a divided model, of which each rank gives its own part; None for a whole one."""
+    """Do as `draw` of the renderer for a model that is divided among ranks; None for a whole model."""
     if not (ranks := _ranks_of(model)).several:
         return None
     find = bands and partial(bands.find, camera.uid)
     view = draw_view(ranks, scene, background, want_depth, train=True, find=find, awake=awake)
     if bands:
-        bands.drawn(camera.uid, view.last)
-    view = surroundings(view) if by_bands else whole_image(view)
+        bands.note_processed(camera.uid, view.last)
+    view = exchange_halo(view) if by_bands else gather_image(view)
     return DividedDrawn(view, scene, want_depth, by_bands, awake, model.shards.blocks)
 
 
 class DividedDrawn:
-    """`Drawn` of the renderer. band: None where every rank has the whole image, or where else it is right.
+    """`Drawn` for a divided model. band: the rows of the image that are valid; None: all.
 
-    The image's gradient needs no more rows than the image has.
+    The image's gradient is read in the valid rows only.
     """
 
     def __init__(

@@ -26,11 +26,11 @@ def log(x: Tensor) -> Tensor:
 
 
 def exponential(x: Tensor) -> Tensor:
-    """e^x in the type of `x`, differentiable. A GPU has bits of its own."""
+    """e^x in the type of `x`, differentiable. Bits on a GPU differ from a CPU's."""
     return _Differentiable.apply(x, lambda x: torch.exp(x) if x.is_cuda else exp(x).to(x.dtype), torch.mul)
 
 
-def root(x: Tensor) -> Tensor:
+def square_root(x: Tensor) -> Tensor:
     """The correctly rounded square root of float32 numbers, differentiable; on a GPU, too.
 
     No such root is nearer than 4 units of float64 to the middle of two float32 numbers, and MKL errs by less than one.
@@ -39,7 +39,7 @@ def root(x: Tensor) -> Tensor:
 
 
 class _Differentiable(torch.autograd.Function):
-    """function(x) = y, and slope(g, y): the gradient g of y times the derivative."""
+    """Apply function(x) = y; its backward is slope(g, y), the gradient g of y times the derivative."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, function: Callable[[Tensor], Tensor], slope: Callable[..., Tensor]) -> Tensor:

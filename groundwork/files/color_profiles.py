@@ -10,7 +10,7 @@ from PIL import Image, ImageCms
 from tqdm import tqdm
 
 from groundwork.files.color_tags import UNKNOWN
-from groundwork.files.image_files import eight_bits, sixteen_bits
+from groundwork.files.image_files import to_eight_bits, to_sixteen_bits
 
 _NEAR = 2  # of 255, that profiles of sRGB by several makers differ
 _MODES = {"RGB": "RGB", "GRAY": "L", "CMYK": "CMYK"}  # Pillow's modes of the spaces that profiles are of
@@ -18,7 +18,7 @@ _SAID: set[str] = set()
 
 
 class _Change(NamedTuple):
-    """How colours in a mode of Pillow become sRGB, None: they stay; and what to say of it, "" for nothing."""
+    """The transform to sRGB, None: colours stay; Pillow's mode that it takes; a message to print, "" for none."""
 
     transform: ImageCms.ImageCmsTransform | None
     mode: str = ""
@@ -26,18 +26,18 @@ class _Change(NamedTuple):
 
 
 def has_other_colors(image: Image.Image) -> bool:
-    """Whether a photo's profile gives it other colours than sRGB would, by its header. Says so, once for a profile."""
+    """Tell by a photo's header whether its profile means other colours than sRGB; a message says so once."""
     return _change_of(image).transform is not None
 
 
-def in_srgb(image: Image.Image) -> Image.Image:
-    """A photo in sRGB by its profile, RGB or RGBA; the photo itself without a profile, or with one of no effect."""
+def to_srgb(image: Image.Image) -> Image.Image:
+    """Return a photo in sRGB, as RGB or RGBA; the photo itself if it has no profile, or one of no effect."""
     change = _change_of(image)
     if change.transform is None:
         return image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
     if image.mode.startswith("I"):
-        image = sixteen_bits(image) if change.mode == "I;16" else eight_bits(image)
+        image = to_sixteen_bits(image) if change.mode == "I;16" else to_eight_bits(image)
     result = change.transform.apply(image if image.mode == change.mode else image.convert(change.mode))
     if alpha:
         result.putalpha(alpha)
@@ -78,7 +78,7 @@ def _read(profile: bytes, mode: str) -> _Change:
 
 
 def _is_srgb(transform: ImageCms.ImageCmsTransform, shown: str) -> bool:
-    """Whether a transform leaves colours as they are. shown: L for a photo of greys, else RGB."""
+    """Tell whether a transform leaves colours as they are. shown: mode of the photo: L for greys, else RGB."""
     steps = np.arange(0, 256, 17, dtype=np.uint8)
     colors = np.stack([steps] * 3 if shown == "L" else np.meshgrid(*[steps] * 3), -1).reshape(-1, 16, 3)
     given = Image.fromarray(np.ascontiguousarray(colors))

@@ -1,4 +1,4 @@
-"""Colours that photos without an ICC profile tell in other ways, as a profile.
+"""ICC profiles for photos that have none, from other fields of their files.
 
 EXIF: Adobe RGB (DCF 2.0). PNG: cICP, sRGB, gAMA and cHRM. HEIC and AVIF: nclx, with the code points of ITU-T H.273.
 """
@@ -91,7 +91,7 @@ def _is_adobe(image: Image.Image) -> bool:
 
 
 def mark_srgb(exif: Image.Exif) -> None:
-    """Let EXIF data of a photo that was converted say so."""
+    """Write into a photo's EXIF data that its colours are sRGB."""
     if ExifTags.IFD.Exif in exif and ExifTags.Base.ColorSpace in (more := exif.get_ifd(ExifTags.IFD.Exif)):
         more[ExifTags.Base.ColorSpace] = 1
 

@@ -21,9 +21,12 @@ _LINGER = 2.0  # seconds in which children of a killed program may still have it
 def locked(folder: Path, program: str, busy: str, option: str, inherited: bool = False) -> Iterator[None]:
     """Keep `folder` for this process. UserError if another process has it.
 
-    program: the command, which names the file of the lock. busy: words for the message about the process that has it.
-    option: with which the user names another folder. inherited: child processes that inherit open files keep the
-    folder, too, until the last of them ends; then the lock's file stays.
+    program: the command; the lock's file has its name.
+    busy: the message's words on the process that has the folder.
+    option: the option that names another folder, for the message.
+    inherited: child processes that inherit open files keep the folder, too, until the last of them ends; the lock's
+    file then stays.
+
     The system releases the lock when its last process ends in any way, so a killed one does not block the folder.
     Without file locks (some network file systems) this does nothing.
     """
@@ -46,7 +49,7 @@ def locked(folder: Path, program: str, busy: str, option: str, inherited: bool =
 
 
 def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -> TextIO | None:
-    """The locked file, which `stack` closes; None where files cannot be locked."""
+    """Lock the file, which `stack` closes; None where files cannot be locked."""
     latest = time.monotonic() + _LINGER
     while True:
         try:
@@ -81,7 +84,7 @@ def _is_at(file: TextIO, path: Path) -> bool:
 
 
 def remove_temporary_files(folder: str | os.PathLike) -> list[Path]:
-    """Remove the temporary files of `atomic_write` below a folder whose process runs no more; return their paths."""
+    """Remove the files below a folder that `atomic_write` of ended processes has left; return their paths."""
     removed = []
     for parent, _, names in os.walk(folder):
         for name in names:

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, PngImagePlugin
 
 from groundwork.files.color_tags import add_profile
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from groundwork.files.writing import atomic_write
 from groundwork.host.errors import UserError
 
@@ -54,24 +54,24 @@ def open_image(path: Path) -> Image.Image:
 
     HEIF only where a reader of it was added to Pillow. A photo without an ICC profile gets that of `add_profile`.
     """
-    path = plain(path)
+    path = plain_path(path)
     image = Image.open(path, formats=[name for name in FORMATS if name != "HEIF" or name in Image.OPEN])
     add_profile(image, path)
     return image
 
 
-def sixteen_bits(image: Image.Image) -> Image.Image:
-    """A grey image of 16 bits, which Pillow has in several modes, in mode I;16."""
+def to_sixteen_bits(image: Image.Image) -> Image.Image:
+    """Convert a grey image of 16 bits, for which Pillow has several modes, to mode I;16."""
     return Image.fromarray(np.clip(np.asarray(image), 0, 65535).astype(np.uint16))
 
 
-def eight_bits(image: Image.Image) -> Image.Image:
-    """A grey image of 16 bits in mode L. Pillow's own conversion clips at 255."""
-    return Image.fromarray(_EIGHT_BITS[np.asarray(sixteen_bits(image))])
+def to_eight_bits(image: Image.Image) -> Image.Image:
+    """Convert a grey image of 16 bits to mode L. Pillow's own conversion clips at 255."""
+    return Image.fromarray(_EIGHT_BITS[np.asarray(to_sixteen_bits(image))])
 
 
 def to_bytes(image: torch.Tensor) -> torch.Tensor:
-    """An image (3, H, W), float in [0, 1] or already uint8, as (H, W, 3) uint8, halves rounded up."""
+    """Convert an image (3, H, W), float in [0, 1] or already uint8, to (H, W, 3) uint8, halves rounded up."""
     import torch
 
     if image.dtype != torch.uint8:
@@ -79,21 +79,21 @@ def to_bytes(image: torch.Tensor) -> torch.Tensor:
     return image.permute(1, 2, 0).contiguous().cpu()
 
 
-def dimmed(image: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
-    """An image (3, H, W), float, darker where a mask (1, H, W) bool leaves it out."""
+def dim_masked(image: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
+    """Darken an image (3, H, W), float, where the mask `counts` (1, H, W) bool is False."""
     import torch
 
     return torch.where(counts, image, _DIM * image)
 
 
 def save_png(image: torch.Tensor, path: Path) -> None:
-    """Write an image as `to_bytes` takes it; the file is written whole or not at all."""
+    """Write an image of a form that `to_bytes` takes; the file is written whole or not at all."""
     with atomic_write(path) as temporary:
         Image.fromarray(to_bytes(image).numpy()).save(temporary)
 
 
 def remove_leftovers(folder: Path, count: int) -> None:
-    """Delete numbered PNGs beyond the first `count`, which an earlier run with more views has left."""
+    """Delete the numbered PNGs from `count` on, which an earlier run with more views has left."""
     for file in folder.glob("*.png"):
         if re.fullmatch(r"\d{5,}", file.stem) and int(file.stem) >= count:
             file.unlink()

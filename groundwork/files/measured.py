@@ -1,4 +1,4 @@
-"""The record of a scene's similarity from points that somebody has measured, as convert.py --orient keeps it."""
+"""A scene's similarity from points that somebody has measured, in the record of convert.py --orient."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -19,15 +19,18 @@ def measured_record(
     ground: np.ndarray | None = None,
     front: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """A record in place of that before, None: there was none. Points are of the scene's world.
+    """Return the record that takes the place of `before`, None: there was none. Points are of the scene's world.
 
-    above: a point (3,) above the ground. scale: metres in its unit. ground: three points (3,3) that are level, their
-    middle becomes the origin. front: two points (2,3), from the left to the right of what is to be looked at straight
-    on. What is not given stays; with ground or front, the place on Earth is not known any more. UserError for points
-    that tell nothing.
+    above: a point (3,) above the ground.
+    scale: metres in a unit of the world.
+    ground: three points (3,3) of one height; their middle becomes the origin.
+    front: the left and the right end (2,3) of what a camera should face.
+
+    What is not given stays; with ground or front, the place on Earth is unknown from then on. UserError for points
+    that determine nothing.
     """
     record = dict(before or {"unit": "scene", "vertical": None})
-    known = Similarity.of(record, "orientation") if before else Similarity(np.eye(3), 1.0, np.zeros(3), upright=False)
+    known = Similarity.read(record, "orientation") if before else Similarity(np.eye(3), 1.0, np.zeros(3), upright=False)
     axes, origin = known.rotation, -known.rotation.T @ known.translation / known.scale
     if ground is not None:
         down = _unit(ground_normal(ground), "the three points of the ground lie on a line; choose others")
@@ -52,14 +55,14 @@ def measured_record(
 
 
 def ground_normal(ground: np.ndarray) -> np.ndarray:
-    """A normal (3,) of three points (3,3), as long as the triangle's least height in parts of its longest side."""
+    """The normal (3,) of three points (3,3); its length is the triangle's least height over its longest side."""
     sides = np.roll(ground, 1, 0) - ground
     longest = np.square(sides).sum(1).max()
     return np.cross(sides[0], sides[1]) / longest.clip(TINY)
 
 
 def _unit(vector: np.ndarray, fault: str) -> np.ndarray:
-    """A vector (3,) at length 1, if it is at least 1e-6 long. UserError with a fault if not, or if it is not finite."""
+    """Scale a vector (3,) to length 1. UserError with `fault` if it is not finite, or shorter than 1e-6."""
     length = np.linalg.norm(vector)
     if not 1e-6 <= length < np.inf:
         raise UserError(fault)
@@ -67,7 +70,7 @@ def _unit(vector: np.ndarray, fault: str) -> np.ndarray:
 
 
 def _level(axes: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Axes (3,3), by rows, with another y (3,), that else differ as little as they can."""
+    """Turn axes (3,3), by rows, as little as gives them the y axis `down` (3,)."""
     ahead = axes[2] - (axes[2] @ down) * down
     if np.linalg.norm(ahead) < 1e-3:  # it looked straight down
         ahead = axes[1] - (axes[1] @ down) * down

@@ -1,7 +1,6 @@
-"""Files and folders that this project wrote without being told their names: only these are replaced or deleted.
+"""Pictures and folders that an export wrote beside its file: only these may be replaced or deleted.
 
-A digest tells them from others, also where somebody has changed them since. A picture has it in a comment, and a folder
-in its name.
+A digest tells whether somebody else wrote or changed one. A picture has the digest in a comment, a folder in its name.
 """
 
 import hashlib
@@ -21,15 +20,15 @@ _MARK = b"3D Gaussian Splatting, sha256 "
 
 
 def is_ours(path: Path, owner: str = "") -> bool:
-    """Whether a picture is as `write_picture` wrote it, or a folder has the digest of its files in its name.
+    """Tell whether a picture is unchanged since `write_picture`, or a folder has the digest of its files in its name.
 
-    owner: as of `digest_of`.
+    owner: as for `folder_digest`.
     """
     if path.is_symlink():
         return False
     if path.is_dir():
         named = re.fullmatch(rf"[a-z]+-([0-9a-f]{{{_DIGITS}}})", path.name)
-        return bool(named) and named[1] == digest_of(path, owner)
+        return bool(named) and named[1] == folder_digest(path, owner)
     if not path.is_file():
         return False
     content = path.read_bytes()
@@ -37,22 +36,22 @@ def is_ours(path: Path, owner: str = "") -> bool:
     return content == _marked(content[:start] + content[start + size :])
 
 
-def digest_of(folder: Path, owner: str) -> str:
-    """Of the files below a folder, by their names and bytes. owner: name of the file that refers to the folder."""
+def folder_digest(folder: Path, owner: str) -> str:
+    """Hash the files below a folder, names and bytes. owner: name of the file that refers to the folder."""
     found = hashlib.sha256(os.fsencode(owner))
-    for path in files_of(folder):
+    for path in sorted_files(folder):
         name = path.relative_to(folder).as_posix()
         found.update(b"\0" + os.fsencode(name) + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return found.hexdigest()[:_DIGITS]
 
 
-def files_of(folder: Path) -> list[Path]:
+def sorted_files(folder: Path) -> list[Path]:
     """All files below a folder, sorted."""
     return sorted(path for path in folder.rglob("*") if path.is_file())
 
 
 def refuse_foreign(path: Path) -> None:
-    """UserError for what has the name of a picture that will be written, and is not ours."""
+    """Raise UserError if a picture would be written over something that is not ours."""
     if os.path.lexists(path) and not is_ours(path):
         raise UserError(
             f"no export wrote {path} as it is, and this one would replace it; move it, or choose another --to"
@@ -60,9 +59,9 @@ def refuse_foreign(path: Path) -> None:
 
 
 def write_picture(path: Path, image: Image.Image, **options: object) -> None:
-    """Write a JPEG or a PNG, whole or not at all. UserError in place of a file that is not ours.
+    """Write a JPEG or a PNG, whole or not at all. UserError if a file that is not ours has the name.
 
-    options: of Pillow's writer.
+    options: passed to Pillow's writer.
     """
     refuse_foreign(path)
     content = io.BytesIO()
@@ -77,7 +76,7 @@ def _marked(picture: bytes) -> bytes:
 
 
 def _place(picture: bytes) -> int:
-    """Where the comment stands: behind the header of a PNG, or the start of a JPEG."""
+    """The offset of the comment: behind the header of a PNG, or the start of a JPEG."""
     return 33 if picture.startswith(b"\x89PNG") else 2
 
 

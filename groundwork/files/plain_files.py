@@ -12,8 +12,8 @@ _FREE = 1 << 16  # rows that any file may have: some 50 MB as splats
 Name = TypeVar("Name", str, os.PathLike)
 
 
-def plain(path: Name) -> Name:
-    """The path. OSError if it names a device, a pipe or a socket; what is missing is left to those who open it."""
+def plain_path(path: Name) -> Name:
+    """Return the path. OSError if it names a device, a pipe or a socket; a missing file raises nothing here."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):
@@ -24,19 +24,20 @@ def plain(path: Name) -> Name:
 
 
 def plain_text(path: str | os.PathLike, errors: str = "strict") -> str:
-    """The text of a file, as of `encoding_of`. OSError if it cannot be read, or has more than MOST bytes; ValueError
-    for other bytes.
+    """Read a text file in the encoding of `encoding_of`.
+
+    OSError if the file cannot be read or has more than MOST bytes; ValueError for bytes that are no such text.
 
     errors: as for `open`.
     """
-    if os.path.getsize(plain(path)) > MOST:
+    if os.path.getsize(plain_path(path)) > MOST:
         raise OSError(errno.EFBIG, f"it has more than {MOST >> 20} MiB", os.fspath(path))
     return Path(path).read_text(encoding=encoding_of(path), errors=errors)
 
 
 def encoding_of(path: str | os.PathLike) -> str:
-    """UTF-16 or UTF-32 where the first bytes of a file say so, as of PowerShell; else UTF-8 with or without a mark."""
-    with open(plain(path), "rb") as file:
+    """Return UTF-16 or UTF-32 if a file begins with its mark, as PowerShell writes it; else UTF-8, marked or not."""
+    with open(plain_path(path), "rb") as file:
         head = file.read(4)
     if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)):
         return "utf-32"
@@ -46,10 +47,10 @@ def encoding_of(path: str | os.PathLike) -> str:
     return {(False, True) * 2: "utf-16-le", (True, False) * 2: "utf-16-be"}.get(tuple(zeros), "utf-8-sig")
 
 
-def not_the_file(path: str | os.PathLike) -> str | None:
-    """Words for a file that is empty, a Git LFS pointer or a web page; None for any other file."""
+def describe_wrong_file(path: str | os.PathLike) -> str | None:
+    """Describe a file that is empty, a Git LFS pointer or a web page; None for any other file."""
     try:
-        with open(plain(path), "rb") as file:
+        with open(plain_path(path), "rb") as file:
             head = file.read(256)
     except OSError:
         return None
@@ -65,8 +66,8 @@ def not_the_file(path: str | os.PathLike) -> str | None:
 def check_packed_rows(count: int, size: int) -> None:
     """ValueError if a compressed file of `size` bytes promises more splats or points than honest ones have.
 
-    Beyond 65,536 it may have one for each byte: trained splats take 10 bytes or more, and a lattice of equal ones, as
-    well as one can compress it, 0.95.
+    More than 65,536 are refused if they exceed the file's bytes: a trained splat takes 10 bytes or more, and one of a
+    lattice of equal splats, compressed as well as possible, 0.95.
     """
     if count > size + _FREE:
         raise ValueError(f"its header announces {count:,} rows, but the file has only {size:,} bytes")

@@ -18,10 +18,11 @@ _PLAIN = (type(None), bool, int, float, str)
 class Machine:
     """Reads pickles of protocol 2 as torch writes them.
 
-    names: the value of each "module name" that a file may use; of these values, functions are called with arguments of
-    the file, which can have any type. persistent: called with a persistent id of the file, its result is used. build:
-    called with an object and the state that the file gives it. leaves: types that a result may hold besides numbers,
-    text, lists, tuples and dicts.
+    names: the value of each "module name" that a file may use; a function among them is called with the file's
+    arguments, which can have any type.
+    persistent: called with a persistent id of the file, returns its value.
+    build: called with an object and the state that the file gives it.
+    leaves: types that a result may hold besides numbers, text, lists, tuples and dicts.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class Machine:
 
 
 def plain_dict(pairs: Any) -> dict[str | int, Any]:
-    """A dict of (key, value) pairs. TypeError for other keys than text and indices, which could take long to hash."""
+    """Make a dict of (key, value) pairs. TypeError for keys other than text and indices: these may hash slowly."""
     result = {}
     for key, value in pairs:
         if type(key) is not str and not (type(key) is int and 0 <= key < 2**63):

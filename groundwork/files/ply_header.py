@@ -1,4 +1,4 @@
-"""PLY files from strangers: the lines of the header, and the elements once the file is long enough for them."""
+"""Read PLY files that may be damaged or hostile: header lines, and elements once the file is known to hold them."""
 
 import codecs
 import io
@@ -16,21 +16,21 @@ _END = "end_header"
 def header_lines(path: str | os.PathLike) -> list[str]:
     """The lines of the header, cut where plyfile cuts them, with `end_header` if it is in the first MiB.
 
-    What is not ASCII is replaced, blanks around a line are cut. [] for a file that is no PLY.
+    Other characters than ASCII are replaced, blanks around a line are cut. [] for a file that is no PLY.
     """
     with open(path, "rb") as file:
         return _header(_single_bytes(file.read(_LONGEST), encoding_of(path)))[0]
 
 
 def _single_bytes(content: bytes, encoding: str) -> bytes:
-    """The bytes of a PLY as those of a text without a mark at its start."""
+    """Encode the text of a PLY without a mark at its start."""
     if encoding == "utf-8-sig":
         return content.removeprefix(codecs.BOM_UTF8)
     return content.decode(encoding, "replace").encode("ascii", "replace")
 
 
 def _header(begin: bytes) -> tuple[list[str], bytes, int]:
-    """The lines of a header at the start of bytes, what ends them, and how many bytes they are."""
+    """Return the lines of the header at the start of bytes, their line end, and their number of bytes."""
     if not begin.startswith(b"ply"):
         return [], b"", 0
     newline = next((end for end in (b"\r\n", b"\r") if begin.startswith(end, 3)), b"\n")
@@ -46,8 +46,8 @@ def _header(begin: bytes) -> tuple[list[str], bytes, int]:
 def read_elements(path: str | os.PathLike) -> PlyData:
     """The elements of a PLY. Before plyfile makes room for their rows, the header and the size of the file are checked.
 
-    ValueError if the header does not end within the first MiB, of which a parser would take minutes and much memory, or
-    if the file is too short for its rows. PlyParseError and others as from plyfile.
+    ValueError if the header does not end within the first MiB, as a parser would take minutes and much memory for a
+    longer one, or if the file is too short for its rows. PlyParseError and others as from plyfile.
     """
     lines = header_lines(path)
     if lines[-1:] != [_END]:
@@ -68,7 +68,7 @@ def read_elements(path: str | os.PathLike) -> PlyData:
 
 
 def _is_clean(path: str | os.PathLike) -> bool:
-    """Whether plyfile takes the header, which must be ASCII without blanks around its lines."""
+    """Tell whether plyfile accepts the header, which must be ASCII without blanks around its lines."""
     with open(path, "rb") as file:
         begin = file.read(_LONGEST)
     lines, newline, size = _header(begin)
@@ -80,7 +80,7 @@ def _is_clean(path: str | os.PathLike) -> bool:
 
 
 def _cleaned(path: str | os.PathLike) -> bytes:
-    """The content of a file with a header that plyfile takes."""
+    """Return the content of a file with a header that plyfile accepts."""
     content = _single_bytes(Path(path).read_bytes(), encoding_of(path))
     lines, newline, size = _header(content[:_LONGEST])
     return newline.join([line.encode("ascii", "replace") for line in lines if line] + [content[size:]])

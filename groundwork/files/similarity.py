@@ -1,4 +1,4 @@
-"""Where a scene stands upright, in metres: a similarity, in a file beside the scene and in model.json."""
+"""The similarity from a scene's world to an upright frame in metres, in a file beside the scene and in model.json."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,9 +20,13 @@ _FARTHEST = 90, 360, 1e9  # PLACE
 class Similarity:
     """A point x (3,) of the scene's world becomes scale * rotation @ x + translation, float64.
 
-    There y is down, as in a usual capture. rotation: (3,3). place: latitude and longitude (degrees) and height (metres)
-    of the origin, where x is east and z north, in metres; empty: unknown. upright: the vertical is known; else only the
-    scale changes. metric: there, a unit is a metre.
+    In the new frame y is down.
+
+    rotation: (3,3).
+    place: latitude and longitude (degrees) and height (metres) of the new frame's origin; x is then east and z north,
+    in metres. Empty: unknown.
+    upright: the vertical is known; else only the scale changes.
+    metric: the unit of the new frame is a metre.
     """
 
     rotation: np.ndarray
@@ -33,8 +37,8 @@ class Similarity:
     metric: bool = False
 
     @classmethod
-    def of(cls, record: Any, where: str) -> "Similarity":
-        """That of a record, which is read at `where`. UserError if it is none."""
+    def read(cls, record: Any, where: str) -> "Similarity":
+        """Read a record. UserError if it describes no similarity. where: name of its file or field, for the message."""
         try:
             rotation = np.array(record["rotation"], np.float64)
             scale, translation = float(record["scale"]), np.array(record["translation"], np.float64)
@@ -57,13 +61,13 @@ class Similarity:
         moved = self.scale * self.rotation @ np.asarray(offset, np.float64) + self.translation
         return replace(self, translation=moved)
 
-    def points(self, points: np.ndarray) -> np.ndarray:
-        """Where points (N,3) come to lie, float64."""
+    def transform(self, points: np.ndarray) -> np.ndarray:
+        """Map points (N,3) into the upright frame, float64."""
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
 
 def read_orientation(scene: Path) -> dict[str, Any] | None:
-    """The record beside a scene; None without one. UserError if it is damaged."""
+    """Read the record beside a scene; None without one. UserError if it is damaged."""
     path = scene / FILE
     if not path.is_file():
         return None
@@ -71,20 +75,20 @@ def read_orientation(scene: Path) -> dict[str, Any] | None:
         record = read_json(path)
     except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is not JSON; run convert.py --orient again, or remove it") from error
-    Similarity.of(record, str(path))
+    Similarity.read(record, str(path))
     return record
 
 
 def recorded_similarity(model: str, scene: str) -> dict[str, Any]:
-    """model.json of a model's folder, with the similarity of the scene where that was oriented after the training."""
+    """Read a model's model.json; add the similarity of the scene if that was oriented after the training."""
     record = read_model_json(model) if model else {}
     found = read_orientation(Path(scene)) if scene and ENTRY not in record else None
     return record if found is None else record | {ENTRY: found}
 
 
 def local_similarity(model: str, scene: str) -> Similarity | None:
-    """The similarity of a model's own coordinates, which may have an offset; None if its scene was not oriented."""
+    """The similarity from a model's own coordinates, offset included; None if the scene was not oriented."""
     record = recorded_similarity(model, scene)
     if ENTRY not in record:
         return None
-    return Similarity.of(record[ENTRY], f"orientation of {model}").from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))
+    return Similarity.read(record[ENTRY], f"orientation of {model}").from_local(record.get(OFFSET, (0.0, 0.0, 0.0)))

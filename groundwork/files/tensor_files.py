@@ -1,7 +1,7 @@
 """Files that torch.save has written: tensors and plain values, read without torch's unpickler.
 
-torch's safe loader lets a file choose how much memory it takes, and calls methods of the types that it is allowed. Here
-a file can make only what Machine makes, plain tensors over bytes that it holds, and floats that NumPy has written.
+torch's safe loader lets a file choose how much memory it takes, and calls methods of the allowed types. Here a file can
+make only values of Machine, plain tensors over bytes that the file holds, and floats that NumPy has written.
 """
 
 import contextlib
@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import torch
 
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from groundwork.files.plain_pickle import MOST_BYTES, Machine, plain_dict
 from groundwork.host.errors import UserError
 
@@ -46,12 +46,13 @@ class _Format:
 def read_tensors(path: str | os.PathLike, *, mapped: bool = False, legacy: bool = False) -> Any:
     """The content of a file: plain values, Tensors and Parameters, on the CPU.
 
-    mapped: tensors stay in the file until somebody reads a part of them. legacy: also take the format before torch
-    1.6. OSError for a file that cannot be opened, UserError for one that does not have its checksums, and ValueError
-    for anything else that torch.save has not written, or that holds other objects. No words of the file are part of a
-    message.
+    mapped: tensors stay in the file until a part of them is read.
+    legacy: also take the format before torch 1.6.
+
+    OSError for a file that cannot be opened, UserError for wrong checksums, ValueError for anything else that
+    torch.save has not written, or that holds other objects. No message quotes the file.
     """
-    with open(plain(path), "rb") as file:
+    with open(plain_path(path), "rb") as file:
         try:
             if file.read(len(_ZIP)) == _ZIP:
                 return _read_archive(file, mapped)
@@ -103,7 +104,7 @@ def _read_archive(file: BinaryIO, mapped: bool) -> Any:
 
 
 def _read_legacy(file: BinaryIO) -> Any:
-    """Read some pickles, of which the last lists the storages whose bytes follow."""
+    """Read several pickles; the last one lists the storages, whose bytes follow it."""
     left = os.fstat(file.fileno()).st_size
     storages: dict[str, tuple[torch.UntypedStorage, int]] = {}
 
@@ -145,7 +146,7 @@ def _filled(storage: torch.UntypedStorage, file: BinaryIO) -> torch.UntypedStora
 
 
 def _machine(stored: Callable[[str, int, int], torch.UntypedStorage]) -> Machine:
-    """A machine for the names that torch.save writes. stored: the bytes of a storage, by key, size and item size."""
+    """Make a machine for the names that torch.save writes. stored: returns a storage for a key, bytes and item size."""
     known: dict[str, torch.UntypedStorage] = {}
 
     def storage(identity: Any) -> _Storage:
@@ -169,7 +170,7 @@ def _machine(stored: Callable[[str, int, int], torch.UntypedStorage]) -> Machine
 def _tensor(
     storage: Any, offset: Any, size: Any, stride: Any, requires_grad: Any = False, _: Any = None
 ) -> torch.Tensor:
-    """A tensor that lies within its storage and does not claim more values than are stored."""
+    """Make a tensor; it must lie within its storage and claim no more values than are stored."""
     if [type(value) for value in (storage, size, stride, requires_grad)] != [_Storage, tuple, tuple, bool]:
         raise TypeError("a tensor of wrong types")
     numbers = (offset, *size, *stride)
@@ -195,7 +196,7 @@ def _ordered_dict(pairs: Any = ()) -> dict[str | int, Any]:
 
 
 def _encode(text: Any, encoding: Any) -> bytes:
-    """Bytes, in the form in which protocol 2 has them."""
+    """Make bytes, which protocol 2 writes as text and an encoding."""
     if type(text) is not str or type(encoding) is not str or encoding != "latin1":
         raise TypeError("bytes of wrong types")
     return text.encode("latin1")
@@ -214,7 +215,7 @@ def _scalar(kind: Any, data: Any) -> float:
 
 
 def _build(value: Any, state: Any) -> None:
-    """Take a state: of a Parameter of torch 0.1, and of others only as far as it changes nothing."""
+    """Apply a state to a Parameter of torch 0.1; accept one for another object only if it changes nothing."""
     if type(value) is torch.nn.Parameter and type(state) is tuple:
         requires_grad = state[-2 if len(state) == 5 else 0]
         if type(requires_grad) is not bool:

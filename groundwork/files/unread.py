@@ -1,4 +1,4 @@
-"""What a file has and no reader uses, told in one line: fields, columns and records of other programs."""
+"""One line on the parts of a file that no reader uses: fields, columns and records of other programs."""
 
 import os
 import sys
@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 
 class Form(NamedTuple):
-    """What the parts of a kind of file are called, and the names of those that change no result."""
+    """A kind of file: what its parts are called, and the names of parts that change no result."""
 
     parts: str
     harmless: frozenset[str]
@@ -51,18 +51,18 @@ FORMS = {
 _TOLD = 3  # names
 
 
-def say_unread(path: str | os.PathLike, form: str, names: Iterable[str]) -> None:
-    """Name at most three parts of a file that its reader does not use, but for those that are harmless.
+def note_unread(path: str | os.PathLike, form: str, names: Iterable[str]) -> None:
+    """Print a line that names up to three parts of a file that its reader skips, harmless ones left out.
 
-    form: a key of FORMS. names: of all parts that the reader passes over; without one, nothing is said.
+    form: a key of FORMS. names: names of all parts that the reader skips.
     """
     parts, harmless = FORMS[form]
     if left := sorted(set(names) - harmless):
         more = f" and {len(left) - _TOLD} more" if len(left) > _TOLD else ""
-        say_once(f"{parts} of {path} that are not used: {', '.join(left[:_TOLD])}{more}")
+        note_once(f"{parts} of {path} that are not used: {', '.join(left[:_TOLD])}{more}")
 
 
 @cache
-def say_once(line: str) -> None:
-    """Print a line to stderr, but once in a process: some commands read a file several times."""
+def note_once(line: str) -> None:
+    """Print a line to stderr, once per process: some commands read a file several times."""
     print(line, file=sys.stderr)

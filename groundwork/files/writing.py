@@ -11,7 +11,7 @@ from groundwork.ranks.ranks import ranks
 
 
 def writes_files() -> bool:
-    """Whether this process writes the files of a training: of several that train together, only the first does."""
+    """Tell whether this process writes a training's files: with several ranks, only the first one does."""
     return ranks().first
 
 
@@ -20,8 +20,8 @@ def atomic_write(path: str | os.PathLike, every_rank: bool = False) -> Iterator[
     """Yield a temporary path beside `path`, with its suffix; rename it to `path` if the block succeeds, else delete it.
 
     Creates a missing folder. A killed process may leave the hidden temporary file, but never half a `path`. An OSError
-    of the block or of renaming (disk full, `path` is a folder) becomes a UserError. Of ranks that train together, only
-    the first writes, and the others' writing leads nowhere. every_rank: each of them writes, as into a cache.
+    of the block or of renaming (disk full, `path` is a folder) becomes a UserError. With several ranks, files of others
+    than the first are dropped. every_rank: each rank writes, as into a cache.
     """
     if not (every_rank or writes_files()):
         yield Path(os.devnull)

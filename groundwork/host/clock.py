@@ -1,4 +1,4 @@
-"""Seconds of this process: since it started, and those in which it was not stopped.
+"""Seconds since this process started, and seconds in which it ran.
 
 A process is stopped by Ctrl-Z, or on a machine that sleeps.
 """
@@ -36,7 +36,7 @@ def wall_seconds() -> float:
 
 
 class _Running:
-    """Counts seconds in which the process was not stopped, if somebody looks at the clock often enough."""
+    """Counts seconds in which the process was not stopped; the clock must be read every two seconds (`tick`)."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -72,7 +72,7 @@ os.register_at_fork(after_in_child=_begin_anew)  # there, no other thread looks 
 
 
 def running_seconds() -> float:
-    """Seconds in which this process was not stopped. Only differences have a meaning, while one user lives (`tick`).
+    """Seconds in which this process was not stopped. Only differences count, and while a user of `tick` lives.
 
     Stops of less than 2 seconds count as running.
     """
@@ -80,7 +80,7 @@ def running_seconds() -> float:
 
 
 def tick(user: object) -> None:
-    """Let a thread look at the clock while `user` lives: without it, a process that waits seems to be stopped."""
+    """Let a thread read the clock while `user` lives; without reads, a process that waits counts as stopped."""
     threading.Thread(target=_look_while, args=(weakref.ref(user),), name="ticks", daemon=True).start()
 
 

@@ -1,4 +1,4 @@
-"""Energy of GPUs as their driver counts it, by NVML. It needs the package nvidia-ml-py, and is not known without it.
+"""Energy of GPUs as their driver counts it, by NVML: unknown without the package nvidia-ml-py.
 
 torch is imported on first use: not every program needs it.
 """
@@ -24,10 +24,10 @@ def nvml_name(device: torch.device) -> str | None:
 
 
 def joules_counter(gpus: Sequence[str | None]) -> Callable[[], float] | None:
-    """What reads the joules that GPUs have used since their driver was loaded; only differences have a meaning.
+    """A function that returns the joules that GPUs have used since their driver was loaded; only differences count.
 
-    gpus: names of `nvml_name`, each GPU of which counts once. The result is NaN where the driver no longer tells. None
-    if one of them is none of NVML's on this host, or does not count its energy.
+    gpus: names from `nvml_name`; a GPU named twice counts once. The function returns NaN once the driver fails. None if
+    NVML does not know one of the GPUs on this host, or the GPU does not count its energy.
     """
     if None in gpus:
         return None

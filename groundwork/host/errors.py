@@ -6,5 +6,5 @@ class UserError(Exception):
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says, in one line of at most 200 characters; its type if it says nothing."""
+    """The first line of an error's text, at most 200 characters; its type if the text is empty."""
     return next(iter(str(error).splitlines()), "")[:200] or type(error).__name__

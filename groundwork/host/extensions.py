@@ -1,6 +1,6 @@
-"""A check that the installed extensions have the modules of this checkout's. Import it before them.
+"""Check that the installed extensions have the modules of this checkout. Import this module before them.
 
-A newer checkout would otherwise end in Python's own message about a missing name.
+Without the check, a newer checkout ends in Python's own message about a missing name.
 """
 
 import importlib.util
@@ -10,7 +10,7 @@ _SOURCES = Path(__file__).resolve().parents[2] / "submodules"
 
 
 def _check() -> None:
-    """Raise ImportError for an extension that is older than its sources here, or somebody else's of that name."""
+    """Raise ImportError for an extension that is older than its sources here, or another project's of that name."""
     for sources in sorted(_SOURCES.glob("*/*/ops.py")):
         package, folder = sources.parent.name, sources.parents[1].name
         found = importlib.util.find_spec(package)

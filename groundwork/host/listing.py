@@ -12,7 +12,7 @@ def some(names: Sequence[str], most: int = 5) -> str:
 
 
 def as_utf8(text: str) -> str:
-    """A text that can be sent or drawn: bytes of a file's name that are not UTF-8 become numbers, `\\udcff`."""
+    """Make a text printable: bytes of a file's name that are not UTF-8 become numbers, `\\udcff`."""
     return text.encode("utf-8", "backslashreplace").decode()
 
 

@@ -38,8 +38,8 @@ def compute_device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() and _has_cuda_kernels() else "cpu")
 
 
-def without_code(error: BaseException) -> str:
-    """What to say of an error if torch or an extension has no code for the current GPU; empty if it is another."""
+def missing_code_message(error: BaseException) -> str:
+    """A message if the error means that torch or an extension has no code for the current GPU; else empty."""
     if "no kernel image is available" not in str(error):
         return ""
     import torch
@@ -61,7 +61,7 @@ def _has_cuda_kernels() -> bool:
 
 
 def cores() -> int:
-    """Processors allowed by affinity (taskset, Slurm) and by the quota of the process's cgroups (Docker's --cpus).
+    """Number of processors allowed by affinity (taskset, Slurm) and by the process's cgroups (Docker's --cpus).
 
     Processes that train together on this host share them evenly.
     """
@@ -75,7 +75,7 @@ def threads(most: int = MOST_THREADS) -> int:
 
 
 def _quota() -> float:
-    """Processors that the cgroup and those around it may use (cpu.max of version 2); infinite without a limit."""
+    """Number of processors that the cgroup and its parents allow (cpu.max of version 2); infinite without a limit."""
     try:
         own = next(line[3:] for line in _OWN_CGROUPS.read_text().splitlines() if line.startswith("0::"))
     except (OSError, StopIteration):
@@ -172,7 +172,7 @@ def facts(device: torch.device | str) -> dict[str, Any]:
     }
 
 
-def facts_asked() -> dict[str, Any]:
+def facts_from_process() -> dict[str, Any]:
     """`facts` of the device that computes; {} if that fails.
 
     A separate process asks, because asking a GPU for its name occupies GPU memory until the process ends.

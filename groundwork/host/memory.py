@@ -1,4 +1,4 @@
-"""Free and used memory, and recognition of errors that mean there is too little of it.
+"""Free and used memory, and recognition of out-of-memory errors.
 
 torch is imported on first use: not every program needs it.
 """
@@ -22,7 +22,7 @@ _CGROUP = Path("/sys/fs/cgroup")
 
 
 def is_out_of_memory(error: BaseException | None) -> bool:
-    """Whether an error, or its cause, says that memory ran out or that there are too many instances to count."""
+    """Tell whether an error, or its cause, means that memory ran out or that there are too many instances to count."""
     if error is None:
         return False
     if isinstance(error, RuntimeError):  # torch.OutOfMemoryError is one, too
@@ -30,8 +30,8 @@ def is_out_of_memory(error: BaseException | None) -> bool:
     return isinstance(error, MemoryError) or is_out_of_memory(error.__cause__)
 
 
-def shortage(error: BaseException, device: torch.device | str) -> str:
-    """Description of such an error: the bytes asked for, or its own words, and the free bytes if known."""
+def describe_shortage(error: BaseException, device: torch.device | str) -> str:
+    """Describe an out-of-memory error: the bytes asked for, or the error's own words, and the free bytes if known."""
     import torch
 
     asked, free = _ASKED.search(str(error)), free_memory(device)

@@ -1,10 +1,10 @@
-"""Limits on threads that spin while they wait for work. Import it before torch and NumPy where you can.
+"""Limits on threads that spin while they wait for work. Import this module before torch and NumPy if possible.
 
-Those of torch's OpenMP spin for milliseconds by default, and so block cores that other programs want. On two busy
+Threads of torch's OpenMP spin for milliseconds by default, and so block cores that other programs want. On two busy
 cores, 300 iterations of a small scene took 42 s, and 9 s with short spinning. On idle cores both take 6 s.
 
-Those of NumPy's OpenBLAS spin for a tenth of a second on every core after a single dot product of 10,000 numbers, as in
-a histogram for TensorBoard. NumPy computes nothing here that is worth a second thread.
+Threads of NumPy's OpenBLAS spin for a tenth of a second on every core after one dot product of 10,000 numbers, as in a
+histogram for TensorBoard. NumPy computes nothing here that is worth a second thread.
 """
 
 import os
@@ -17,8 +17,8 @@ _MOST_TEAMS = 4  # where torch uses so few of the cores that more would be neede
 def _add_idle_teams() -> None:
     """Shorten the spinning of an OpenMP that has read its settings already, as in a program that imports torch first.
 
-    GNU's spins 100 times once there are more threads than cores (its manual, GOMP_SPINCOUNT). Threads that sleep count:
-    each team of ours has done one small task, and waits for another for ever.
+    GNU's OpenMP spins only 100 times once there are more threads than cores (its manual, GOMP_SPINCOUNT). Sleeping
+    threads count, so this starts teams that do one small task and then wait for ever.
     """
     import torch
 

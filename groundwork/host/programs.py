@@ -1,4 +1,4 @@
-"""Programs that others have installed: on PATH or in the repository, never in the folder that a user works in."""
+"""Search for installed programs, on PATH or in the repository, but never in the current folder."""
 
 import os
 import shutil
@@ -8,7 +8,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 def forget_relative_path() -> None:
-    """Take what depends on the current folder out of PATH, for this process and those it starts.
+    """Remove entries that depend on the current folder from PATH, for this process and those it starts.
 
     An empty entry stands for the current folder, too.
     """

@@ -1,4 +1,4 @@
-"""Progress bars: a line that is drawn anew on a terminal, and in a log file a new line now and then."""
+"""Progress bars: one line that is redrawn on a terminal, and a new line now and then in a log file."""
 
 import time
 from collections.abc import Callable, Iterable
@@ -13,7 +13,7 @@ INTERVAL = 10.0  # seconds between the lines in a log
 
 
 class Bar(tqdm):
-    """tqdm's bar, of which a file or a pipe gets a line at most every INTERVAL seconds, and one when it is done."""
+    """tqdm's bar; a file or a pipe gets a line at most every INTERVAL seconds, and one at the end."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         self._shown, self._line = time.monotonic(), ""

@@ -1,4 +1,4 @@
-"""Reading what a GPU computes without waiting for what is queued afterwards."""
+"""Read a GPU's results without waiting for kernels that are queued after them."""
 
 from collections.abc import Callable
 
@@ -7,9 +7,9 @@ from torch import Tensor
 
 
 def read_later(numbers: Tensor) -> Callable[[], list]:
-    """Begin to copy numbers to the host. The result of this call returns them, and waits for nothing queued after it.
+    """Begin to copy numbers to the host; the returned function gives them, without waiting for later kernels.
 
-    So a GPU has work until the host has read the numbers and queued what depends on them.
+    So a GPU has work until the host has read the numbers and queued the kernels that depend on them.
     """
     if not numbers.is_cuda:
         return numbers.tolist

@@ -42,10 +42,10 @@ def prepare() -> None:
     keep_freed_memory()
 
 
-def imported() -> None:
-    """Call when all is imported: signals raise exceptions from now on, and garbage is collected, but for the imports.
+def after_imports() -> None:
+    """Call after a command's imports: signals raise exceptions, and garbage is collected, imported objects left out.
 
-    Programs are not looked for in the current folder.
+    Programs are no longer looked for in the current folder.
 
     Without `prepare`, as where other code calls this, its garbage is its own.
     """
@@ -65,7 +65,7 @@ def imported() -> None:
 
 
 def open_outputs() -> None:
-    """Let an output that is closed (`>&-`) lead nowhere, and one that cannot write a letter write its number."""
+    """Discard what is written to a closed output (`>&-`), and let an output write the number of a letter it lacks."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -106,7 +106,7 @@ def begin_cuda() -> threading.Thread | None:
 
 
 def _computes_on_a_gpu() -> bool:
-    """Whether the rasterizer was built with CUDA kernels: its library then asks torch for a stream."""
+    """Tell whether the rasterizer was built with CUDA kernels; its library then uses torch's streams."""
     found = importlib.util.find_spec("diff_gaussian_rasterization")
     library = found and found.origin and Path(found.origin).with_name("_backend.so")
     try:
@@ -127,7 +127,7 @@ def _make_context() -> None:
 
 
 def typed_command(script: str) -> str:
-    """How a command of this program is called from here: its Python (python where that is what runs), and its path."""
+    """The command line of a script as typed in the current folder: this Python (python, if that is it) and the path."""
     found, own = find_program("python"), Path(sys.executable)
     python = "python" if found and Path(found).absolute() == own.absolute() else _typed(own)
     return f"{python} {_typed(_ROOT / script)}"

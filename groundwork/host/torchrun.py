@@ -1,4 +1,4 @@
-"""Facts that torchrun tells each process that it starts, by the environment. A process of another parent is alone."""
+"""The environment variables that torchrun sets for each process. Without them, a process is alone."""
 
 import os
 
@@ -11,12 +11,12 @@ def size() -> int:
 
 
 def rank() -> int:
-    """This process's number among them, from 0."""
+    """Number of this process among all of them, from 0."""
     return _number("RANK", 0) if size() > 1 else 0
 
 
 def local_rank() -> int:
-    """This process's number among those of its host, which is the number of its GPU."""
+    """Number of this process among those of its host, and of its GPU."""
     return _number("LOCAL_RANK", 0) if size() > 1 else 0
 
 
@@ -26,7 +26,7 @@ def local_size() -> int:
 
 
 def restarts() -> int:
-    """How often torchrun has started all processes again after a fault (--max-restarts)."""
+    """Number of times that torchrun has started all processes again after a fault (--max-restarts)."""
     return _number("TORCHELASTIC_RESTART_COUNT", 0)
 
 

@@ -1,1 +1,1 @@
-"""The processes of a training over several GPUs, and what they tell each other."""
+"""The processes of a training over several GPUs, and their communication."""

@@ -1,4 +1,4 @@
-"""Start and end of train.py as one rank of several, by the means of torch.distributed alone.
+"""Start and end of train.py as one rank of several, by torch.distributed alone.
 
 torchrun ends all ranks once one has ended with an error, and says which was the first. A rank that waits for another
 one in a collective call gives up after TIMEOUT. A rank's uncaught error goes into torchrun's own report (`record`).
@@ -33,10 +33,9 @@ _LOST = ("by peer", "broken pipe", "timed out", "timeout")
 
 @record
 def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], object]], tuple[int, str]]) -> int:
-    """Run a command as one rank of several. Returns its exit status, and has printed why, if it is not 0.
+    """Run a command as one rank of several; print an error and return the exit status.
 
-    outcome: runs a function, and gives its exit status and what there is to say of it. It raises an error that it does
-    not know.
+    outcome: runs a function and returns its exit status and the message to print; raises errors that it does not know.
     """
     rank = torchrun.rank()
     with contextlib.nullcontext() if rank == 0 else _silence():
@@ -64,14 +63,14 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Print nothing, and show no progress bar: rank 0 does."""
+    """Print nothing and show no progress bar: only rank 0 does."""
     tqdm.__init__ = partialmethod(tqdm.__init__, disable=True)
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
         yield
 
 
 def _is_lost(error: RuntimeError) -> bool:
-    """Whether a collective call failed because of another rank."""
+    """Tell whether a collective call failed because of another rank."""
     return isinstance(error, dist.DistError) or any(words in str(error).lower() for words in _LOST)
 
 
@@ -85,14 +84,14 @@ def _join_and_run(main: Callable[[], object]) -> None:
     os.environ.setdefault("TORCH_NCCL_WAIT_TIMEOUT_DUMP_MILSEC", "1000")  # else a minute more after the limit
     dist.init_process_group(store=store, rank=rank, world_size=size, timeout=TIMEOUT, **options)
     ranks = SeveralRanks()
-    refuse_differences(ranks.everyone(_machine(device)), "start all ranks with the same installation")
+    refuse_differences(ranks.all_gather_objects(_machine(device)), "start all ranks with the same installation")
     with using(ranks):
         main()
     ranks.leave()
 
 
 def _own_device() -> torch.device:
-    """The device of this rank, on GPUs the current one from now on. The ranks of a host share its cores."""
+    """Choose this rank's device, and make a GPU the current one. Ranks of a host share its cores."""
     device = compute_device()
     if os.environ.get("OMP_NUM_THREADS", "1") == "1":  # which torchrun sets where the user does not
         torch.set_num_threads(cores())

@@ -1,4 +1,4 @@
-"""Several processes that train together, by torch.distributed: gloo on CPUs, NCCL on GPUs."""
+"""Communication of several ranks by torch.distributed: gloo on CPUs, NCCL on GPUs."""
 
 from collections.abc import Callable, Sequence
 from datetime import timedelta
@@ -21,8 +21,7 @@ TIMEOUT = timedelta(minutes=2)
 class SeveralRanks(Ranks):
     """The ranks of the default process group.
 
-    Numbers and objects of the host go by a group of CPUs. Tensors go by NCCL, where the group has it, or else by way of
-    the CPU.
+    Numbers and objects of the host use a gloo group. Tensors use NCCL if the group has it, else copies on the CPU.
     """
 
     def __init__(self) -> None:
@@ -31,25 +30,25 @@ class SeveralRanks(Ranks):
         self._place = "cuda" if by_gpu else "cpu"  # of what the default group sends
         self._numbers = dist.new_group(backend="gloo", timeout=TIMEOUT) if by_gpu else dist.group.WORLD
         self._silence = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)
-        self._news, self._heard = [0] * _NEWS, [0] * _NEWS
+        self._piggybacked, self._latest = [0] * _NEWS, [0] * _NEWS
 
     def leave(self) -> None:
-        """Leave the group, and end its threads. One that met the end of Python would abort the process."""
+        """Leave the group and end its threads: a thread that is left at Python's exit aborts the process."""
         self._numbers = None  # which keeps the threads
         dist.destroy_process_group()
 
-    def numbers(self, *values: int) -> Tensor:
+    def all_gather_host_ints(self, *values: int) -> Tensor:
         mine = torch.tensor(values, dtype=torch.int64)
         everyone = [torch.empty_like(mine) for _ in range(self.size)]
         dist.all_gather(everyone, mine, group=self._numbers)
         return torch.stack(everyone)
 
-    def shared(self, value: Value, holder: int = 0) -> Value:
+    def broadcast_object(self, value: Value, holder: int = 0) -> Value:
         box = [value]
         dist.broadcast_object_list(box, src=holder, group=self._numbers)
         return box[0]
 
-    def handed(
+    def broadcast_from(
         self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
     ) -> Tensor:
         if self.rank == holder:
@@ -59,41 +58,41 @@ class SeveralRanks(Ranks):
         dist.broadcast(received, holder)
         return received.to(device)
 
-    def everyone(self, value: Value) -> list[Value]:
+    def all_gather_objects(self, value: Value) -> list[Value]:
         box: list = [None] * self.size
         dist.all_gather_object(box, value, group=self._numbers)
         return box
 
-    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
-        news = torch.tensor(self._news, device=self._place) if any(self._news) else self._silence
+    def all_gather_ints(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
+        news = torch.tensor(self._piggybacked, device=self._place) if any(self._piggybacked) else self._silence
         flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
-        found = read_later(self._table(torch.cat((numbers.to(self._place), flag, news))))
+        found = read_later(self._all_gather(torch.cat((numbers.to(self._place), flag, news))))
         meanwhile()
         found = found()
         first = len(numbers)
         flags = [row[first] for row in found]
         if flags[self.rank] < max(flags):
             self.flag.fill_(max(flags))
-        self._heard = [max(each) for each in zip(*(row[first + 1 :] for row in found), strict=True)]
+        self._latest = [max(each) for each in zip(*(row[first + 1 :] for row in found), strict=True)]
         return [row[:first] for row in found]
 
-    def post(self, *news: int) -> None:
-        self._news, self._heard = news, None
+    def piggyback(self, *news: int) -> None:
+        self._piggybacked, self._latest = news, None
 
-    def heard(self) -> Sequence[int]:
-        if self._heard is None:
-            self.agree(self._silence[:0])
-        return self._heard
+    def latest(self) -> Sequence[int]:
+        if self._latest is None:
+            self.all_gather_ints(self._silence[:0])
+        return self._latest
 
-    def table(self, values: Tensor) -> Tensor:
-        return self._table(values.detach().contiguous().to(self._place)).to(values.device)
+    def all_gather(self, values: Tensor) -> Tensor:
+        return self._all_gather(values.detach().contiguous().to(self._place)).to(values.device)
 
-    def _table(self, mine: Tensor) -> Tensor:
+    def _all_gather(self, mine: Tensor) -> Tensor:
         every = mine.new_empty(self.size * mine.numel())
         getattr(dist, ALL_GATHER)(every, mine.view(-1))
         return every.view(self.size, *mine.shape)
 
-    def added(self, values: Tensor) -> Tensor:
+    def all_reduce_sum(self, values: Tensor) -> Tensor:
         total = values.detach().to(self._place)
         dist.all_reduce(total)
         return total.to(values.device)
@@ -107,7 +106,7 @@ class SeveralRanks(Ranks):
         return received.to(rows.device), counts
 
     def _counts(self, sizes: Sequence[int]) -> list[int]:
-        """How many rows each rank sends here, where this one sends `sizes`."""
+        """Exchange row counts: this rank sends sizes[r] rows to rank r; returns how many each rank sends here."""
         sent = torch.tensor(sizes, dtype=torch.int64, device=self._place)
         counts = torch.empty_like(sent)
         dist.all_to_all_single(counts, sent)

@@ -1,4 +1,4 @@
-"""The processes (ranks) that train together. By itself, a process is all of them.
+"""The processes (ranks) that train together. A process by itself is the only rank.
 
 torch is imported on first use: not every program needs it.
 """
@@ -21,51 +21,54 @@ _SHORT = 60  # letters of a value that a message shows
 
 
 class Ranks:
-    """One process by itself; the base of several (distributed/process_group.py), whose calls are collective.
+    """One process by itself; the base class of several ranks (groundwork/ranks/process_group.py).
 
-    Every rank has to make the same collective calls in the same order. rank: of this process, from 0; size: how many
-    there are. Rank 0 writes the files and prints.
+    Calls are collective: every rank has to make the same calls in the same order. Rank 0 writes the files and prints.
+
+    rank: number of this process, from 0.
+    size: number of ranks.
     """
 
     rank = 0
     size = 1
-    flag: Tensor | None = None  # (1,) int64, which each `agree` raises to the largest of all ranks
+    flag: Tensor | None = None  # (1,) int64, which each `all_gather_ints` raises to the largest of all ranks
 
     @property
     def several(self) -> bool:
-        """Whether there are others."""
+        """True if there are other ranks."""
         return self.size > 1
 
     @property
     def first(self) -> bool:
-        """Whether this is the rank that writes and prints."""
+        """True for the rank that writes and prints."""
         return self.rank == 0
 
-    def numbers(self, *values: int) -> Tensor:
-        """The whole numbers that each rank gives, of which all give as many: (size, len(values)) int64 on the CPU."""
+    def all_gather_host_ints(self, *values: int) -> Tensor:
+        """Gather integers of the host, as many from each rank: (size, len(values)) int64 on the CPU."""
         import torch
 
         return torch.tensor([values], dtype=torch.int64)
 
-    def shared(self, value: Value, holder: int = 0) -> Value:
-        """The value of one rank, the holder; of the others it is not read. It can be any object that pickles."""
+    def broadcast_object(self, value: Value, holder: int = 0) -> Value:
+        """Return the holder's value on every rank; the other ranks' value is ignored. Any object that pickles."""
         return value
 
-    def handed(
+    def broadcast_from(
         self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
     ) -> Tensor:
-        """The values of one rank, the holder, which have a shape and dtype that all know; on others, on a device."""
+        """Broadcast the holder's tensor, whose shape and dtype all ranks know; the others receive it on `device`."""
         return values
 
-    def everyone(self, value: Value) -> list[Value]:
-        """All ranks' values, in the order of ranks; any objects that pickle."""
+    def all_gather_objects(self, value: Value) -> list[Value]:
+        """Return all ranks' values in the order of ranks; any objects that pickle."""
         return [value]
 
-    def agree(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
-        """The whole numbers (n,) int64 of each rank, by rank; the host waits for them.
+    def all_gather_ints(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
+        """Gather integers (n,) int64 of all ranks, in the order of ranks; the host waits for them.
 
-        meanwhile: called before the host waits, to queue what a GPU does until the host goes on. `flag` and what was
-        posted go with them, so that these need no exchange of their own.
+        `flag` and the numbers of `piggyback` are exchanged in the same call.
+
+        meanwhile: called before the host waits, to queue work for a GPU.
         """
         from groundwork.host.read_later import read_later
 
@@ -73,31 +76,32 @@ class Ranks:
         meanwhile()
         return [found()]
 
-    def post(self, *news: int) -> None:
-        """Leave two whole numbers, 0 or more, that go with the next `agree`."""
-        self._news = news
+    def piggyback(self, *news: int) -> None:
+        """Leave two integers, 0 or more, for the next `all_gather_ints` to exchange."""
+        self._piggybacked = news
 
-    def heard(self) -> Sequence[int]:
-        """The largest of all ranks of each of the numbers that were posted last."""
-        return self._news
+    def latest(self) -> Sequence[int]:
+        """Return the maximum over ranks of each of the two numbers of the last `piggyback`."""
+        return self._piggybacked
 
-    def table(self, values: Tensor) -> Tensor:
-        """All ranks' values (...), which have one shape and dtype: (size, ...) on their device."""
+    def all_gather(self, values: Tensor) -> Tensor:
+        """Gather all ranks' values (...), of one shape and dtype: (size, ...) on their device."""
         return values[None]
 
-    def added(self, values: Tensor) -> Tensor:
-        """The sum over all ranks, in no certain order: for whole numbers, or where all but one rank have 0.
+    def all_reduce_sum(self, values: Tensor) -> Tensor:
+        """Sum over all ranks, in no certain order: for integers, or where all ranks but one have 0.
 
-        It may take the place of the values.
+        The sum may overwrite `values`.
         """
         return values
 
     def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
-        """Send the first sizes[0] of the rows (n, ...) to rank 0, the next to rank 1, and so on.
+        """Send the first sizes[0] of the rows (n, ...) to rank 0, the next sizes[1] to rank 1, and so on.
 
-        counts: how many rows each rank sends here, if this is known; else the ranks tell each other, which a GPU waits
-        for. Rows have one dtype, not of 16 bits, and the same trailing shape on every rank. Returns the rows for this
-        rank, in the order of ranks, and how many each has sent.
+        rows: of one dtype, not of 16 bits, and one trailing shape on every rank.
+        counts: number of rows that each rank sends here, if known; else ranks exchange it, for which a GPU waits.
+
+        Returns the rows received, in the order of ranks, and the number of rows from each rank.
         """
         return rows, list(sizes)
 
@@ -113,22 +117,22 @@ class Ranks:
         rows, counts = self.send(torch.cat(list(parts)), list(map(len, parts)))
         return list(rows.split(counts))
 
-    def gather(self, rows: Tensor, counts: Sequence[int] | None = None) -> Tensor:
-        """All ranks' rows (n, ...), in the order of ranks. counts: how many each has, if this is known (`send`)."""
+    def all_gather_rows(self, rows: Tensor, counts: Sequence[int] | None = None) -> Tensor:
+        """Gather all ranks' rows (n, ...), in the order of ranks. counts: rows of each rank, if known (see `send`)."""
         if not self.several:
             return rows
         import torch
 
         return self.send(torch.cat([rows] * self.size), [len(rows)] * self.size, counts)[0]
 
-    def before(self, count: int) -> tuple[int, int]:
-        """The sum of all counts of lower ranks, and of all ranks."""
-        counts = self.numbers(count)[:, 0]
+    def offset_and_total(self, count: int) -> tuple[int, int]:
+        """Return the sum of the lower ranks' counts, and the sum over all ranks."""
+        counts = self.all_gather_host_ints(count)[:, 0]
         return int(counts[: self.rank].sum()), int(counts.sum())
 
-    def anyone(self, fact: bool) -> bool:
-        """Whether a fact holds on any rank."""
-        return bool(self.numbers(int(fact)).any())
+    def any_rank(self, fact: bool) -> bool:
+        """Tell whether `fact` is true on any rank."""
+        return bool(self.all_gather_host_ints(int(fact)).any())
 
 
 ALONE = Ranks()
@@ -142,7 +146,7 @@ def ranks() -> Ranks:
 
 @contextmanager
 def using(several: Ranks) -> Iterator[Ranks]:
-    """Within it, `ranks` gives these."""
+    """Let `ranks` return `several` inside the block."""
     global _current
     before, _current = _current, several
     try:
@@ -152,9 +156,10 @@ def using(several: Ranks) -> Iterator[Ranks]:
 
 
 def refuse_differences(facts: Sequence[Mapping[str, str]], remedy: str, shown: bool = True) -> None:
-    """UserError that names the facts by which ranks differ from rank 0, and these ranks.
+    """Raise UserError if ranks differ from rank 0 in a fact; the message names facts and ranks.
 
-    facts: by rank, the values by name. shown: with the values of one of these ranks.
+    facts: values by name, for each rank.
+    shown: whether the message has rank 0's values, and those of one rank that differs.
     """
     first = facts[0]
     for rank, others in enumerate(facts):

@@ -1,4 +1,4 @@
-"""Rows of Gaussians that ranks share: which rows a rank holds, and how they are divided again after a change."""
+"""The division of a model's rows among ranks, and their redistribution after a change."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -20,62 +20,64 @@ _PART, _RANK = 43, 32  # bits of a key below the number of a part, and below the
 
 
 class Shards:
-    """All rows of one process; the base of rows that are divided among ranks.
+    """The rows of a model that one process has alone; the base class of divided rows.
 
-    ranks: those that share the rows. first: index of this rank's first row among all.
+    ranks: the ranks that share the rows.
+    first: index of this rank's first row among all rows.
     """
 
     ranks: Ranks = ALONE
     first = 0
 
     def total(self, count: int) -> int:
-        """The number of all rows, where this rank has `count`."""
+        """Number of rows on all ranks. count: this rank's."""
         return count
 
-    def of(self, count: int) -> "Shards":
-        """The place of `count` rows in another model, or after a change. Every rank must call it."""
+    def resized(self, count: int) -> "Shards":
+        """Return the shards of another model, or after a change, with `count` rows here. Every rank must call it."""
         return self
 
     @property
     def blocks(self) -> Sequence[int] | None:
-        """How many blocks of rows each rank has; None for one process."""
+        """Number of blocks of rows of each rank; None for one process."""
         return None
 
-    def own(self, values: Tensor) -> Tensor:
+    def own_rows(self, values: Tensor) -> Tensor:
         """This rank's part of the values (N, ...) of all rows."""
         return values
 
-    def whole(self, values: Tensor) -> Tensor:
-        """All rows (N, ...), on the CPU of the rank that writes files; none elsewhere. Every rank must call it."""
+    def gather_whole(self, values: Tensor) -> Tensor:
+        """Gather all rows (N, ...) on the CPU of the rank that writes files. Every rank must call it."""
         return values
 
     def pieces(self, count: int, part: Callable[[slice], Tensor]) -> Iterator[Tensor]:
-        """All rows in order, piece by piece, on the rank that writes files; others get none, yet must go through all.
+        """Yield all rows in order, piece by piece, on the rank that writes files; other ranks must iterate, too.
 
-        count: of this rank's rows; part: gives some of them (n, ...).
+        count: number of this rank's rows.
+        part: returns a slice of this rank's rows (n, ...).
         """
         ranks = self.ranks
-        for holder, rows in enumerate(ranks.numbers(count)[:, 0].tolist()):
+        for holder, rows in enumerate(ranks.all_gather_host_ints(count)[:, 0].tolist()):
             for start in range(0, rows, PIECE):
                 piece = part(slice(start, start + PIECE) if holder == ranks.rank else slice(0, 0))
                 received = ranks.exchange([piece, *[piece[:0]] * (ranks.size - 1)])
                 if ranks.first:
                     yield received[holder]
 
-    def items(self, indices: Tensor) -> Tensor:
-        """Indices (n,) among all rows, of those of this rank."""
+    def global_indices(self, indices: Tensor) -> Tensor:
+        """Convert indices (n,) of this rank's rows to indices among all rows."""
         return indices
 
-    def marked(self, mask: Tensor) -> int:
-        """How many values of all masks (N,) bool are true."""
-        return self.ranks.before(int(mask.sum()))[1]
+    def count_marked(self, mask: Tensor) -> int:
+        """Count the true values of all ranks' masks (N,) bool."""
+        return self.ranks.offset_and_total(int(mask.sum()))[1]
 
-    def places(self, mask: Tensor) -> Tensor:
-        """Indices (n,) among all rows, of those that any rank marks by a mask (N,) bool."""
-        return self.ranks.gather(self.items(mask.nonzero().reshape(-1)))
+    def marked_indices(self, mask: Tensor) -> Tensor:
+        """Return the indices (n,) among all rows that the ranks' masks (N,) bool mark."""
+        return self.ranks.all_gather_rows(self.global_indices(mask.nonzero().reshape(-1)))
 
     def choose(self, weights: Tensor, count: int, *, seed: int, stream: Stream, iteration: int) -> Tensor:
-        """Own rows, (n,) int64 ascending, of `count` of all, drawn one after another by the weights of those left.
+        """Draw `count` of all rows without replacement, by weight; return this rank's, (n,) int64 ascending.
 
         weights: (N,) float64. A row whose weight is not above 0, or not finite, is never drawn, so there may be fewer.
         Algorithm A-Res (Efraimidis and Spirakis 2006): with a uniform number u for each row, the largest
@@ -83,76 +85,79 @@ class Shards:
         threads or ranks.
         """
         rows = ((weights > 0) & weights.isfinite()).nonzero().reshape(-1)
-        if self.ranks.before(len(rows))[1] <= count:
+        if self.ranks.offset_and_total(len(rows))[1] <= count:
             return rows
         waits = -log(_uniform(random_bits(seed, stream, iteration, rows + self.first))) / weights[rows]
         return rows[self.lowest(waits, count)].sort().values
 
     def lowest(self, values: Tensor, count: int, *, highest: bool = False) -> Tensor:
-        """Indices, in no order, of this rank's values (n,) that are among the `count` lowest of all; ties by place.
+        """Return indices, in no order, of this rank's values (n,) among the `count` lowest of all; the first of equals.
 
-        highest: among the highest, ties by place as well. No rank sends more than `count` values.
+        highest: the highest instead, again the first of equals. No rank sends more than `count` values.
         """
         ranks, count = self.ranks, max(count, 0)
         mine = torch.argsort(values, descending=highest, stable=True)[:count]
         if not ranks.several:
             return mine
-        every = ranks.gather(values[mine])  # of equal values of a rank the first comes first, as ranks do
-        chosen = torch.argsort(every, descending=highest, stable=True)[:count] - ranks.before(len(mine))[0]
+        every = ranks.all_gather_rows(values[mine])  # of equal values of a rank the first comes first, as ranks do
+        chosen = torch.argsort(every, descending=highest, stable=True)[:count] - ranks.offset_and_total(len(mine))[0]
         return mine[chosen[(chosen >= 0) & (chosen < len(mine))]]
 
     def largest(self, values: Tensor) -> Tensor:
-        """The largest value, a scalar, of all ranks' values (n,), of which some rank must have one."""
+        """The maximum, a scalar, of all ranks' values (n,); at least one rank must have a value."""
         if self.ranks.several:
-            values = self.ranks.gather(values.amax(0, keepdim=True) if len(values) else values)
+            values = self.ranks.all_gather_rows(values.amax(0, keepdim=True) if len(values) else values)
         return values.max()
 
     def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
-        """Rows for the Gaussians that draws are made for, from the ranks that the draws fell on.
+        """Send the rows of drawn Gaussians to the ranks for which they were drawn. Every rank must call it.
 
-        rows (n, ...) of this rank belong to `draws` (n,), ascending. counts (size,): draws received by each rank, in
-        rank order. Every rank must call it.
+        rows: this rank's rows (n, ...) that were drawn.
+        draws: (n,), ascending, the number of the draw of each row.
+        counts: (size,), number of draws for each rank, in the order of ranks.
         """
         return rows
 
     def changing(self, gaussians: Any) -> AbstractContextManager[None]:
-        """Context of a change of rows, at whose end they are divided again; within another one it does nothing."""
+        """Divide the rows again at the end of the block, which changes them; a nested call does nothing."""
         return nullcontext()
 
-    def match(self, optimizer: torch.optim.Optimizer | None) -> None:
-        """Give every rank the last one's step counters, for the groups that have a state there, and in that order.
+    def match_steps(self, optimizer: torch.optim.Optimizer | None) -> None:
+        """Copy the last rank's step counters, and the order of states, to every rank. Every rank must call it.
 
-        A rank without Gaussians takes no steps, and the last rank has some if any has. Every rank must call it.
+        A rank without Gaussians takes no steps; the last rank has Gaussians if any has.
         """
 
     def sort(self, gaussians: Any, codes: Tensor) -> None:
-        """Put all rows into the order of their codes (N,) int64; ties keep theirs. Every rank must call it."""
+        """Sort all rows by their codes (N,) int64, stably. Every rank must call it."""
         gaussians.table.permute(codes.argsort(stable=True))
 
-    def kept(self, indices: Tensor) -> None:
-        """Take note of the rows (n,) that were kept."""
+    def note_kept(self, indices: Tensor) -> None:
+        """Note that only these rows (n,) were kept."""
 
-    def appended(self, count: int) -> None:
-        """Take note of rows that were appended, of which all ranks' follow each other in the order of ranks."""
+    def note_appended(self, count: int) -> None:
+        """Note that `count` rows were appended; all ranks' new rows follow each other in the order of ranks."""
 
-    def order(self, *pieces: Tensor) -> None:
-        """Change the order of the rows that were appended last: piece by piece, over all ranks.
+    def order_appended(self, *pieces: Tensor) -> None:
+        """Order the rows that were appended last piece by piece, over all ranks.
 
-        pieces: for each row of a piece a number (n,) int64 that orders the rows of this piece on all ranks.
+        pieces: for each piece numbers (n,) int64, one a row, by which the rows of the piece are ordered over all ranks.
         """
 
 
 class Divided(Shards):
     """Rows that are divided among several ranks.
 
-    While rows change, each has a key, which orders the rows of all ranks as one process would. keys: (n,) int64,
-    ascending, or None. changed: whether this rank's rows have changed.
+    While rows change, keys order the rows of all ranks as one process would.
+
+    keys: (n,) int64, ascending, or None.
+    changed: whether this rank's rows have changed.
     """
 
     def __init__(self, ranks: Ranks, count: int) -> None:
-        """Take the place of this rank's rows, `count` of them. Every rank must call it."""
+        """Find the place of this rank's `count` rows among all. Every rank must call it."""
         self.ranks = ranks
-        self.first, self._total = ranks.before(count)
+        self.first, self._total = ranks.offset_and_total(count)
         self.keys: Tensor | None = None
         self.changed = False
         self._parts = 0
@@ -160,7 +165,7 @@ class Divided(Shards):
     def total(self, count: int) -> int:
         return self._total
 
-    def of(self, count: int) -> "Shards":
+    def resized(self, count: int) -> "Shards":
         return Divided(self.ranks, count)
 
     @property
@@ -168,11 +173,11 @@ class Divided(Shards):
         ends = [-(-bound(rank, self._total, self.ranks.size) // BLOCK) for rank in range(self.ranks.size + 1)]
         return [end - first for first, end in pairwise(ends)]
 
-    def own(self, values: Tensor) -> Tensor:
+    def own_rows(self, values: Tensor) -> Tensor:
         return own_rows(values, self.ranks)
 
-    def whole(self, values: Tensor) -> Tensor:
-        total = self.ranks.before(len(values))[1]
+    def gather_whole(self, values: Tensor) -> Tensor:
+        total = self.ranks.offset_and_total(len(values))[1]
         every = torch.empty(total if self.ranks.first else 0, *values.shape[1:], dtype=values.dtype)
         filled = 0
         for piece in self.pieces(len(values), lambda rows: values.detach()[rows].to(compute_device())):
@@ -180,7 +185,7 @@ class Divided(Shards):
             filled += len(piece)
         return every
 
-    def items(self, indices: Tensor) -> Tensor:
+    def global_indices(self, indices: Tensor) -> Tensor:
         return indices + self.first
 
     def send_draws(self, rows: dict[str, Tensor], draws: Tensor, counts: Tensor) -> dict[str, Tensor]:
@@ -201,7 +206,7 @@ class Divided(Shards):
             self.keys = None
 
     def _divide_again(self, gaussians: Any) -> None:
-        if self.ranks.anyone(self.changed):
+        if self.ranks.any_rank(self.changed):
             self._move(gaussians, self.keys)
 
     def sort(self, gaussians: Any, codes: Tensor) -> None:
@@ -211,32 +216,32 @@ class Divided(Shards):
 
     @torch.no_grad()
     def _move(self, gaussians: Any, keys: Tensor) -> None:
-        """Move all that belongs to rows to the places of their keys (n,), ascending, one tensor at a time."""
+        """Move rows, with optimiser state and statistics, to where their keys (n,), ascending, put them."""
         ranks = self.ranks
-        counts = ranks.numbers(len(keys))[:, 0].tolist()
+        counts = ranks.all_gather_host_ints(len(keys))[:, 0].tolist()
         # The place of a key: how many keys of all ranks come before it, and of equal ones those of lower ranks.
         places = torch.arange(len(keys), device=keys.device)
-        for rank, part in enumerate(ranks.gather(keys).split(counts)):
+        for rank, part in enumerate(ranks.all_gather_rows(keys).split(counts)):
             if rank != ranks.rank:
                 places = places + torch.searchsorted(part, keys, right=rank < ranks.rank)
         bounds = [bound(rank, sum(counts), ranks.size) for rank in range(ranks.size + 1)]
         moves = Redistribution(ranks, places, bounds)
-        self.match(gaussians.optimizer)
+        self.match_steps(gaussians.optimizer)
         table = gaussians.table
         groups, own = [*table.optimised, *table.others], table.row_groups()
         here = [any(group is other for other in own) for group in groups]
-        everywhere = ranks.numbers(*map(int, here)).all(dim=0).tolist()
+        everywhere = ranks.all_gather_host_ints(*map(int, here)).all(dim=0).tolist()
         table.change(moves, [group for group, moving in zip(groups, everywhere, strict=True) if moving])
-        gaussians.shards = self.of(moves.count)
+        gaussians.shards = self.resized(moves.count)
 
-    def match(self, optimizer: torch.optim.Optimizer | None) -> None:
+    def match_steps(self, optimizer: torch.optim.Optimizer | None) -> None:
         if optimizer is None:
             return
         params, states = [group["params"][0] for group in optimizer.param_groups], optimizer.state
         make = getattr(optimizer, "state_of", None)
         order = {param: number for number, param in enumerate(states)}
         mine = [number for param in params for number in (order.get(param, -1), _steps(states.get(param, {})))]
-        last = self.ranks.numbers(*mine)[-1].reshape(-1, 2).tolist()
+        last = self.ranks.all_gather_host_ints(*mine)[-1].reshape(-1, 2).tolist()
         for place, steps, index in sorted((*numbers, index) for index, numbers in enumerate(last)):
             param = params[index]
             if place < 0 or (param not in states and make is None):
@@ -247,15 +252,15 @@ class Divided(Shards):
             if torch.is_tensor(state.get("step")):
                 state["step"].fill_(steps)
 
-    def kept(self, indices: Tensor) -> None:
+    def note_kept(self, indices: Tensor) -> None:
         self.keys, self.changed = self.keys[indices], True
 
-    def appended(self, count: int) -> None:
+    def note_appended(self, count: int) -> None:
         self._parts, self.changed = self._parts + 1, True
         first = (self._parts << _PART) + (self.ranks.rank << _RANK)
         self.keys = torch.cat((self.keys, first + torch.arange(count, device=self.keys.device)))
 
-    def order(self, *pieces: Tensor) -> None:
+    def order_appended(self, *pieces: Tensor) -> None:
         new = torch.cat([(number << _RANK) + piece for number, piece in enumerate(pieces)])
         self.keys[len(self.keys) - len(new) :] = (self._parts << _PART) + new
 
@@ -264,18 +269,18 @@ WHOLE = Shards()
 
 
 def bound(rank: int, total: int, size: int) -> int:
-    """The first of all rows that a rank has, once they are divided evenly by blocks."""
+    """The index of a rank's first row when all rows are divided evenly by blocks."""
     return min(rank * -(-total // BLOCK) // size * BLOCK, total)
 
 
 def own_rows(values: Tensor, ranks: Ranks) -> Tensor:
-    """This rank's part of the values (N, ...) of all rows, as a copy, so that the rest can be freed."""
+    """Copy this rank's part of the values (N, ...) of all rows, so that the rest can be freed."""
     first, stop = (bound(rank, len(values), ranks.size) for rank in (ranks.rank, ranks.rank + 1))
     return values[first:stop].clone()
 
 
 def changes_rows(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of a model, or a function of one, that every rank must call, and after which rows are divided again."""
+    """Decorate a method or function of a model that changes rows: they are divided again. Every rank must call it."""
 
     @wraps(method)
     def changing(gaussians: Any, *args: Any, **named: Any) -> Any:
@@ -286,15 +291,16 @@ def changes_rows(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class Redistribution:
-    """The rows that each rank sends and receives, to be applied to one tensor after the other.
+    """A movement of rows between ranks, to be applied to one tensor after the other.
 
-    count: of this rank's rows afterwards.
+    count: number of this rank's rows afterwards.
     """
 
     def __init__(self, ranks: Ranks, places: Tensor, bounds: Sequence[int]) -> None:
-        """Move rows to their places (n,) int64, ascending, among those of all ranks. Every rank must call it.
+        """Plan the movement. Every rank must call it.
 
-        bounds: rank r gets the places from bounds[r] to bounds[r + 1].
+        places: (n,) int64, ascending, the new indices of this rank's rows among all rows.
+        bounds: rank r gets the indices from bounds[r] to bounds[r + 1].
         """
         self._ranks = ranks
         first, stop = bounds[ranks.rank : ranks.rank + 2]
@@ -305,10 +311,10 @@ class Redistribution:
         self._sent[ranks.rank] = self._stay[:0]
         arrived = torch.cat(ranks.exchange([places[indices] for indices in self._sent]))
         self._here, self._there = places[self._stay] - first, arrived - first
-        self._any = ranks.anyone(len(arrived) + sum(map(len, self._sent)) > 0)
+        self._any = ranks.any_rank(len(arrived) + sum(map(len, self._sent)) > 0)
 
     def __call__(self, values: Tensor) -> Tensor:
-        """The values of the rows (N, ...) that this rank has afterwards. Every rank must call it."""
+        """Move a tensor's rows (N, ...); return this rank's new ones. Every rank must call it."""
         if not self._any:
             return values
         arrived = self._ranks.exchange([values[indices] for indices in self._sent])

@@ -11,23 +11,26 @@ from groundwork.host.memory import is_out_of_memory
 from groundwork.ranks.ranks import Ranks
 
 
-def divided(
+def share_images(
     sizes: Mapping[Hashable, int], own: Callable[[Hashable], Tensor], device: torch.device, ranks: Ranks
 ) -> tuple[set[Hashable], dict[Hashable, "SharedImage"]]:
-    """Of images, given with their bytes, those that this rank decodes, and all as shared ones.
+    """Divide images among ranks: return the keys that this rank decodes, and all images as shared ones.
 
-    own: the image of a key, on `device`. A shared image has the attributes of InMemory; all ranks read its pixels
-    together.
+    A shared image has the attributes of InMemory; all ranks read its pixels together.
+
+    sizes: bytes of each image.
+    own: decodes the image of a key to `device`.
     """
-    chosen = dict(zip(sizes, holders(sizes.values(), ranks.size), strict=True))
+    chosen = dict(zip(sizes, assign_holders(sizes.values(), ranks.size), strict=True))
     shared = {key: SharedImage(ranks, chosen[key], partial(own, key), device) for key in sizes}
     return {key for key in sizes if chosen[key] == ranks.rank}, shared
 
 
 class SharedImage:
-    """An image that its holder alone decodes and keeps.
+    """An image that one rank, the holder, decodes and keeps.
 
-    ranks: all that use it; holder: one of them. own: gives the image on `device`, and is called by the holder only.
+    ranks: all ranks that use the image.
+    own: decodes the image to `device`; only the holder calls it.
     """
 
     def __init__(self, ranks: Ranks, holder: int, own: Callable[[], Tensor], device: torch.device) -> None:
@@ -39,16 +42,16 @@ class SharedImage:
 
     @property
     def pixels(self) -> Tensor:
-        """The image on all ranks, which have to ask for it together. UserError on all, as of the holder.
+        """The image; all ranks have to read it together. A UserError of the holder is raised on all ranks.
 
-        Only decoding shows its shape, and whether it can be read at all; the holder says so at first.
+        Shape and dtype are known only after decoding, so the holder first broadcasts these, or its error.
         """
         mine = None
         if self._form is None:
             mine, self._form = self._decoded()
         elif self._ranks.rank == self._holder:
             mine = self._own()
-        return self._ranks.handed(self._holder, mine, *self._form, self._device)
+        return self._ranks.broadcast_from(self._holder, mine, *self._form, self._device)
 
     def _decoded(self) -> tuple[Tensor | None, tuple[torch.Size, torch.dtype]]:
         mine = said = None
@@ -60,20 +63,20 @@ class SharedImage:
                 if is_out_of_memory(error):  # of this rank alone
                     raise
                 said = str(error)
-        said = self._ranks.shared(said, self._holder)
+        said = self._ranks.broadcast_object(said, self._holder)
         if isinstance(said, str):
             raise UserError(said)
         return mine, said
 
-    def changed(self, change: Callable[[Tensor], Tensor]) -> "SharedImage":
-        """Another image, which the same rank makes of this one when all first ask for it, and keeps."""
+    def transformed(self, change: Callable[[Tensor], Tensor]) -> "SharedImage":
+        """Return another image, which the holder makes of this one on its first use, and keeps."""
         return SharedImage(self._ranks, self._holder, cache(lambda: change(self._own())), self._device)
 
 
-def holders(sizes: Iterable[int], ranks: int) -> list[int]:
-    """The rank that keeps each image, of so many bytes: the one that has the fewest so far.
+def assign_holders(sizes: Iterable[int], ranks: int) -> list[int]:
+    """Choose for each image, of `sizes` bytes, the rank that holds the fewest bytes so far.
 
-    So images of one size go to ranks 0, 1, 2 and so on in turn.
+    Images of one size go to ranks 0, 1, 2 and so on in turn.
     """
     filled, chosen = [0] * ranks, []
     for size in sizes:

@@ -24,11 +24,11 @@ class LPIPS(nn.Module):
     def forward(self, x: Tensor, y: Tensor) -> Tensor:
         """Distance of images (B, 3, H, W) or (3, H, W): (1, 1, 1, 1), the sum over the batch; differentiable.
 
-        Values go to the network as they are. It expects [-1, 1], but tables of 3DGS come from images in [0, 1].
+        Values are passed on unchanged. The network expects [-1, 1], but tables of 3DGS come from images in [0, 1].
         """
         x, y = (image[None] if image.dim() == 3 else image for image in (x, y))
         return self.net(x, y).sum(0, keepdim=True)
 
     def train(self, mode: bool = True) -> "LPIPS":
-        """Keeps the mode of evaluation: in the other one, dropout makes the distance random."""
+        """Stay in evaluation mode: in training mode, dropout makes the distance random."""
         return super().train(False)

@@ -1,4 +1,4 @@
-"""Cameras: sides of photos, opening angles, principal points, shared lenses, places, scale, rounded coordinates."""
+"""Checks of cameras: sides of photos, opening angles, principal points, shared lenses, places, scale, rounding."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -17,9 +17,9 @@ from scene.readers.info import (
     SceneInfo,
     are_exchanged,
     camera_centers,
-    exchanged_sides,
+    describe_exchanged_sides,
+    outliers,
     photo_size,
-    standing_apart,
 )
 from scene.readers.scene_folder import find_capture
 from scene.readers.start_cloud import nearest_to_axes
@@ -46,16 +46,16 @@ _MEETING = 0.05  # of the distance to where axes meet, by which they may miss it
 _LONGER = 0.03  # difference of focal lengths that counts
 
 
-def of_cameras(info: SceneInfo) -> Iterator[Finding]:
-    """What is wrong with the cameras."""
-    yield from wrong_forms(info)
-    yield from of_lenses(info)
+def check_cameras(info: SceneInfo) -> Iterator[Finding]:
+    """Check forms of poses, lenses, sides and places of the cameras."""
+    yield from check_pose_forms(info)
+    yield from check_lens_shapes(info)
     yield from _exchanged([*info.train_cameras, *info.test_cameras])
     yield from _places(info)
 
 
-def wrong_forms(info: SceneInfo) -> Iterator[Finding]:
-    """Poses that, where no points tell more, look like those of another form, as of a matrix that is inverted."""
+def check_pose_forms(info: SceneInfo) -> Iterator[Finding]:
+    """Find poses that look like another form's, such as inverted matrices; only where no points can tell."""
     centers = camera_centers(info.train_cameras)
     if len(centers) < _FEWEST or not (info.has_random_points or info.point_cloud is None):
         return
@@ -69,8 +69,8 @@ def wrong_forms(info: SceneInfo) -> Iterator[Finding]:
             yield Finding("the cameras stand around a place and look away from it", OTHER_FORMS)
 
 
-def of_lenses(info: SceneInfo) -> Iterator[Finding]:
-    """What also explains that points do not fit the photos."""
+def check_lens_shapes(info: SceneInfo) -> Iterator[Finding]:
+    """Check rounding, opening angles and principal points: causes by which points may not fit the photos."""
     views = [*info.train_cameras, *info.test_cameras]
     yield from _rounded(info, views)
     pinholes = [view for view in views if _chart(view) != "equirectangular"]
@@ -84,8 +84,8 @@ def _chart(view: CameraInfo) -> str:
 
 
 def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
-    """Large coordinates, as of maps, that were written with too few digits for the scene's extent."""
-    if not (info.offset.any() and info.extent) or any(wrong_forms(info)):
+    """Find large coordinates, as of maps, that were written with too few digits for the scene's extent."""
+    if not (info.offset.any() and info.extent) or any(check_pose_forms(info)):
         return
     centers = camera_centers(views) + info.offset
     moves = np.array([view.T - view.R.T @ info.offset for view in views])  # as COLMAP's files have them
@@ -102,7 +102,7 @@ def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
 
 
 def _step(values: np.ndarray, least: float) -> float | None:
-    """The step, `least` or more, to which the largest values are rounded: by decimal digits, or as float32."""
+    """The step, at least `least`, to which the largest values are rounded: by decimal digits, or as float32."""
     size = np.abs(values)
     if not np.isfinite(size).all() or not size.any():
         return None
@@ -118,11 +118,11 @@ def _step(values: np.ndarray, least: float) -> float | None:
 
 
 def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
-    """Photos of whose camera the width is their height; our own readers refuse them."""
+    """Find photos whose width is their camera's height; our own readers refuse them."""
     wrong = [(view, size) for view in views if are_exchanged(size := photo_size(view), (view.width, view.height))]
     if wrong:
         (view, size), names = wrong[0], [view.image_name for view, _ in wrong]
-        text, remedy = exchanged_sides(names, len(views), size, (view.width, view.height))
+        text, remedy = describe_exchanged_sides(names, len(views), size, (view.width, view.height))
         yield Finding(text, remedy, Severity.HOPELESS)
 
 
@@ -134,7 +134,7 @@ def opening(view: CameraInfo) -> tuple[float, float]:
 
 
 def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
-    """Angles that no usual lens has, and pixels that are far from square."""
+    """Find unusual opening angles, and pixels that are far from square."""
     odd: Counter[str] = Counter()
     examples: dict[str, tuple[CameraInfo, float]] = {}
     for view in views:
@@ -159,7 +159,7 @@ def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
 
 
 def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
-    """Principal points at an edge or toward a corner of the photo; a photo cut out of a larger one may have any."""
+    """Find principal points at an edge or near a corner of the photo; a crop of a larger photo may have any."""
     odd = []
     for view in views:
         across, down = view.cx / view.width, view.cy / view.height
@@ -174,16 +174,16 @@ def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
 
 
 def _places(info: SceneInfo) -> Iterator[Finding]:
-    """Cameras in one place, or far away from the others."""
+    """Find cameras in one place, or far away from the others."""
     cameras = info.train_cameras
     centers = camera_centers(cameras)
     spread = np.linalg.norm(centers - centers.mean(axis=0), axis=1).max()
     # Where they do, the extent is not theirs but the distance of the points (`scene_extent`).
-    if len(centers) > 1 and info.extent and spread < NARROW * info.extent and not any(wrong_forms(info)):
+    if len(centers) > 1 and info.extent and spread < NARROW * info.extent and not any(check_pose_forms(info)):
         text = f"all cameras stand in one place, {spread:.2g} units apart and {info.extent:.2g} from the points"
         text += ", so depth cannot be found"
         yield Finding(text, "take photos from places some steps apart, or give cameras and points in one unit")
-    apart = standing_apart(centers)
+    apart = outliers(centers)
     if apart.any():
         names = [camera.image_name for camera, far in zip(cameras, apart, strict=True) if far]
         text = (
@@ -194,7 +194,7 @@ def _places(info: SceneInfo) -> Iterator[Finding]:
 
 
 def check_lenses(source: str, views: Sequence[CameraInfo]) -> Iterator[Finding]:
-    """Photos that share a camera although their EXIF data tell different focal lengths."""
+    """Find photos that share a camera although their EXIF data have different focal lengths."""
     shared: dict[tuple, Counter[float]] = {}
     shots = find_capture(Path(source)).place
     for view in views:
@@ -215,8 +215,8 @@ def check_lenses(source: str, views: Sequence[CameraInfo]) -> Iterator[Finding]:
 
 
 def check_extent(info: SceneInfo) -> Iterator[Finding]:
-    """Scale of the scene."""
-    if any(wrong_forms(info)):
+    """Check the scale of the scene."""
+    if any(check_pose_forms(info)):
         return
     low, high = EXTENT
     if low <= info.extent <= high:

@@ -1,4 +1,4 @@
-"""A scene that convert.py made: its stages, the photos that it left out, and what has changed since."""
+"""Checks of a scene that convert.py made: its stages, photos left out, and photos changed since."""
 
 import os
 from collections.abc import Iterator
@@ -9,21 +9,21 @@ from groundwork.files.json_files import read_json
 from groundwork.finding import Finding, fine, note
 from groundwork.host import torchrun
 from groundwork.host.listing import some
-from scene.readers.scene_folder import REPORT, WORK, find_capture, is_apart, is_scene
+from scene.readers.scene_folder import REPORT, WORK, find_capture, is_scene, is_unrelated
 
 REGISTERED = 0.9  # share of the photos that a good conversion places
 
 
-def state_of(path: Path) -> list[Any]:
+def file_state(path: Path) -> list[Any]:
     """Describe a file, so that changes show: name, bytes, time of the last change."""
     stat = path.stat()
     return [path.name, stat.st_size, stat.st_mtime_ns]
 
 
-def stages_of(source: str | os.PathLike) -> dict[str, Any]:
-    """Return what the last conversion in a folder wrote of its stages, in stages.json; {}: nothing, or it is damaged.
+def read_stages(source: str | os.PathLike) -> dict[str, Any]:
+    """Read the record of the last conversion in a folder, stages.json; {} if it is missing or damaged.
 
-    Each has `done`, and `made_from`; the notes `options` and `files` have those of that conversion.
+    Each stage has `done` and `made_from`; the notes `options` and `files` are those of that conversion.
     """
     try:
         return {name: dict(entry) for name, entry in read_json(Path(source) / WORK / "stages.json").items()}
@@ -33,7 +33,7 @@ def stages_of(source: str | os.PathLike) -> dict[str, Any]:
 
 def is_unfinished(source: str | os.PathLike) -> bool:
     """Return True if a conversion was begun in a folder, and ended before its last stage."""
-    return bool(found := stages_of(source)) and not found.get("capture", {}).get("done")
+    return bool(found := read_stages(source)) and not found.get("capture", {}).get("done")
 
 
 def awaits_conversion(source: str | os.PathLike) -> bool:
@@ -41,22 +41,22 @@ def awaits_conversion(source: str | os.PathLike) -> bool:
     folder = Path(source)
     if not folder.is_dir() or torchrun.size() > 1 or (is_scene(folder) and not is_unfinished(folder)):
         return False
-    if stages_of(folder):
+    if read_stages(folder):
         return True
     found = find_capture(folder.absolute())
-    return is_apart(folder) and bool(found.photos or found.videos or os.path.lexists(folder / "input"))
+    return is_unrelated(folder) and bool(found.photos or found.videos or os.path.lexists(folder / "input"))
 
 
-def changed_photos(source: str | os.PathLike) -> str | None:
+def describe_changed_photos(source: str | os.PathLike) -> str | None:
     """Say which photos of a scene that convert.py made are new, gone or changed since; None: none."""
-    stages, found = stages_of(source), find_capture(Path(source))
+    stages, found = read_stages(source), find_capture(Path(source))
     try:
         before = dict(stages["files"]["made_from"])
         ignored = set(read_json(Path(source) / REPORT)["unused"])
     except (OSError, LookupError, TypeError, ValueError):
         return None
     paths = {name: path for name in before for path in (Path(source, name), found.place / name) if path.is_file()}
-    there = {name: state_of(path) for name, path in paths.items()}
+    there = {name: file_state(path) for name, path in paths.items()}
     if not there or is_unfinished(source):
         return None
     changed = [name for name, state in there.items() if state != before[name]]
@@ -69,8 +69,8 @@ def changed_photos(source: str | os.PathLike) -> str | None:
     return f"{text}again, with the options that it had" if said else None
 
 
-def left_out(source: str | os.PathLike) -> str | None:
-    """What convert.py could not place of the photos of a scene that it made; None: nothing, or another made it."""
+def describe_left_out(source: str | os.PathLike) -> str | None:
+    """Describe the photos that convert.py could not place; None if it placed all, or did not make the scene."""
     try:
         report = read_json(Path(source) / REPORT)
         placed, count = int(report["registered"]), int(report["photos"])
@@ -82,8 +82,8 @@ def left_out(source: str | os.PathLike) -> str | None:
     return f"this scene has {share} of its capture; capture.html in it says what is missing" if placed < count else None
 
 
-def already_undistorted(source: str | os.PathLike) -> bool:
-    """Whether convert.py made a scene of undistorted photos."""
+def has_undistorted_photos(source: str | os.PathLike) -> bool:
+    """Tell whether convert.py has undistorted the photos of the scene."""
     try:
         return read_json(Path(source) / REPORT)["lenses"] == "undistort"
     except (OSError, ValueError, KeyError, TypeError):
@@ -91,11 +91,11 @@ def already_undistorted(source: str | os.PathLike) -> bool:
 
 
 def check_conversion(source: str | os.PathLike) -> Iterator[Finding]:
-    """How many photos convert.py has placed, if it made the scene."""
+    """Check the number of photos that convert.py has placed, if it made the scene."""
     path = Path(source) / REPORT
     if is_unfinished(source):
         yield Finding("a conversion of this scene was not finished", "train.py finishes it, or run convert.py again")
-    if text := changed_photos(source):
+    if text := describe_changed_photos(source):
         yield note(text)
     if not path.is_file():
         return

@@ -1,4 +1,4 @@
-"""Faults of lenses, units and poses that the tracks of structure from motion show."""
+"""Checks of lenses, units and poses by the tracks of structure from motion."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -26,7 +26,7 @@ _ADJUST = "adjust the model again (COLMAP: bundle_adjuster)"
 
 
 def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
-    """Compare lenses with the tracks, then poses, as wrong lenses would look like wrong poses."""
+    """Check lenses by the tracks, then poses: wrong lenses would look like wrong poses."""
     views = info.train_cameras
     try:
         tracks = read_tracks(source, views, info.offset)
@@ -37,17 +37,17 @@ def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
 
 
 def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> Iterator[Finding]:
-    """Another focal length, or another unit of the points, with which the tracks fit far better."""
+    """Find another focal length, or another unit of the points, that fits the tracks far better."""
     step = max(1, len(views) // COMPARED)
     pairs = [pair for pair in zip(views[::step], tracks[::step], strict=True) if pair[1] is not None]
     if not pairs:
         return
-    given = np.array([_missed(view, track) for view, track in pairs])
-    units = {k: np.array([_missed(*pair, unit=k) for pair in pairs]) for k in UNITS}
+    given = np.array([_median_miss(view, track) for view, track in pairs])
+    units = {k: np.array([_median_miss(*pair, unit=k) for pair in pairs]) for k in UNITS}
     unit = min(units, key=lambda k: np.median(units[k]))
     # The rays are those of the given focal length, so that they are too short where that is too long.
-    factor = float(np.median([_longer(*pair) for pair in pairs]))
-    longer = np.array([_missed(*pair, factor=factor) for pair in pairs])
+    factor = float(np.median([_focal_factor(*pair) for pair in pairs]))
+    longer = np.array([_median_miss(*pair, factor=factor) for pair in pairs])
     best = units[unit] if np.median(units[unit]) < np.median(longer) else longer
     if (best < _ADJUSTED * given).mean() < _MOST:
         return
@@ -59,13 +59,13 @@ def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> 
         yield Finding(text, f"scale the points by {unit:g}")
 
 
-def _longer(view: CameraInfo, track: Track) -> float:
-    """The focal length that fits a track best, by the given one."""
+def _focal_factor(view: CameraInfo, track: Track) -> float:
+    """The focal length that fits a track best, as a factor of the given one."""
     places = np.nan_to_num(rays_to(track.points @ view.R + view.T, track.angular))
     return float(np.median((track.rays * places).sum(axis=1) / np.maximum((places**2).sum(axis=1), 1e-9)))
 
 
-def _missed(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1.0) -> float:
+def _median_miss(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1.0) -> float:
     """Median distance of points from their rays, in parts of the focal length."""
     places = rays_to(unit * track.points @ view.R + view.T, track.angular)
     away = np.linalg.norm(track.rays - factor * places, axis=1)
@@ -75,10 +75,7 @@ def _missed(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1
 def pose_errors(
     views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float
 ) -> tuple[float, float] | None:
-    """Pixels from points to where photos show them (median), with their poses and with the best ones; None: no tracks.
-
-    Of COMPARED views.
-    """
+    """Median reprojection error (pixels) of COMPARED views, with given poses and with the best; None: no tracks."""
     errors, step = [], max(1, len(views) // COMPARED)
     for view, track in zip(views[::step], tracks[::step], strict=True):
         if track is None:
@@ -90,12 +87,12 @@ def pose_errors(
 
 
 def poses_differ(given: float, best: float) -> bool:
-    """Whether better poses fit the tracks far better (`pose_errors`)."""
+    """Tell whether the best poses fit the tracks far better than the given ones (errors of `pose_errors`)."""
     return given > _SEEN and best < _ADJUSTED * given
 
 
 def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float) -> Iterator[Finding]:
-    """Tracks that other poses fit far better than the given ones, as after a bundle adjustment they cannot."""
+    """Find poses that are far from the best ones, which they cannot be after a bundle adjustment."""
     found = pose_errors(views, tracks, extent)
     if found is None:
         return
@@ -109,7 +106,7 @@ def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], ext
 
 
 def check_agreement(folder: Path) -> Iterator[Finding]:
-    """Photos of a COLMAP model whose tracks contradict each other, as where a part of it is in a wrong place."""
+    """Find photos of a COLMAP model whose tracks contradict each other, as if a part of it is in a wrong place."""
     import pycolmap
 
     from scene.agreement import FLOOR, pairs_by_tracks, verdict

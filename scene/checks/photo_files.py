@@ -1,6 +1,6 @@
-"""Files of photos: the same photo twice, which counts twice or is scored after it has trained, and blur.
+"""Checks of photo files: duplicates, which count twice or are scored after they have trained, and blur.
 
-Blur takes fine detail more than coarse detail of the same photo, whatever it shows: see `sharpness`.
+Blur removes more of the fine detail than of the coarse detail of a photo: see `sharpness`.
 """
 
 import hashlib
@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from groundwork.files.color_profiles import in_srgb
-from groundwork.files.image_files import UNREADABLE, eight_bits, open_image
+from groundwork.files.color_profiles import to_srgb
+from groundwork.files.image_files import UNREADABLE, open_image, to_eight_bits
 from groundwork.finding import Finding
 from groundwork.host.listing import some
 from scene.readers.info import CameraInfo, SceneInfo
@@ -29,8 +29,8 @@ _DIRECTIONS = np.array([(0, 1), (1, 0), (1, 1), (1, -1)])
 _BLURRED = 0.25
 
 
-def of_duplicates(info: SceneInfo, halves: bool = False) -> Iterator[Finding]:
-    """Photos of several views. halves: test views are training views, too, on purpose."""
+def check_duplicates(info: SceneInfo, halves: bool = False) -> Iterator[Finding]:
+    """Find photos that several views have. halves: test views are also training views, on purpose."""
     train = info.train_cameras
     tests = [] if halves else list(info.test_cameras)
     groups = [group for group in _same_photos([*train, *tests]) if len(group) > 1]
@@ -96,8 +96,8 @@ def _same_pose(one: CameraInfo, other: CameraInfo, extent: float) -> bool:
     return moved < _SAME_PLACE * extent and turned < _SAME_TURN
 
 
-def of_blur(info: SceneInfo, most: int) -> Iterator[Finding]:
-    """Blurred photos, among at most `most` in a random order."""
+def check_blur(info: SceneInfo, most: int) -> Iterator[Finding]:
+    """Find blurred photos, among at most `most` in a random order."""
     found = {}
     for number in np.random.default_rng(0).permutation(len(info.train_cameras))[:most]:
         view = info.train_cameras[number]
@@ -119,17 +119,19 @@ def small(path: Path, side: int = _WIDTH) -> np.ndarray:
 def shrunk(image: Image.Image, mode: str, side: int) -> np.ndarray:
     """An image (H, W, channels) uint8 in sRGB and Pillow's `mode`, with at most `side` pixels a side."""
     image.draft("RGB", (side, side))  # decodes a large JPEG at a fraction of its size
-    pixels = in_srgb(image)
-    pixels = (eight_bits(pixels) if pixels.mode.startswith("I") else pixels).convert(mode)
+    pixels = to_srgb(image)
+    pixels = (to_eight_bits(pixels) if pixels.mode.startswith("I") else pixels).convert(mode)
     pixels.thumbnail((side, side))
     return np.asarray(pixels)
 
 
 def sharpness(pixels: np.ndarray) -> float:
-    """How much of a photo's detail is fine, along the direction in which that is least, as motion blurs along one.
+    """The share of fine detail of a photo, in the direction where it is least: motion blurs along one direction.
 
-    pixels: (H, W, 3), 0 to 255. It is the energy of second differences (after Nayar and Nakagawa 1994) at a distance of
-    one pixel over that at _COARSE. NaN: the photo has no detail.
+    The share is the energy of second differences (after Nayar and Nakagawa 1994) at a distance of one pixel, over the
+    energy at _COARSE. NaN: the photo has no detail.
+
+    pixels: (H, W, 3), 0 to 255.
     """
     grey = pixels.mean(2, dtype=np.float32)
     if min(grey.shape) <= 2 * _COARSE:

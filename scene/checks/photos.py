@@ -1,4 +1,4 @@
-"""Faults of photos: sizes, photos of which nothing counts, pixels that all of them share."""
+"""Checks of photos: sizes, photos of which no pixel counts, pixels that all photos share."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -36,7 +36,7 @@ _HIDDEN = {
 
 
 class Photo(NamedTuple):
-    """A photo that has no camera yet, as it is displayed."""
+    """A photo without a camera yet, as it is displayed."""
 
     image_name: str
     image_path: Path
@@ -44,14 +44,14 @@ class Photo(NamedTuple):
 
     @property
     def image(self) -> Image.Image | None:
-        """The upright photo, None: the file is upright."""
+        """The upright photo; None if the file is upright."""
         with open_image(self.image_path) as image:
             turned = image.getexif().get(ExifTags.Base.Orientation, 1) not in (0, 1)
             return ImageOps.exif_transpose(image) if turned else None
 
 
 class Look(NamedTuple):
-    """A photo with at most _PIXELS a side.
+    """A reduced photo, with at most _PIXELS a side.
 
     pixels: (h, w, 3) uint8, sRGB. visible, kept: (h, w) bool, by alpha and by the mask. size: the photo's own width and
     height.
@@ -76,7 +76,7 @@ class Look(NamedTuple):
 
 
 def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
-    """Number and sizes of the photos."""
+    """Check number and sizes of the photos."""
     sizes = Counter(camera.file_size for camera in cameras)
     listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
     listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
@@ -88,7 +88,7 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
 
 
 def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True) -> Iterator[Finding]:
-    """Find photos that show nothing, and pixels that all share; at most `most` photos are decoded.
+    """Find photos of which no pixel counts, and pixels that all photos share; at most `most` photos are decoded.
 
     has_alpha: whether their alpha counts.
     """
@@ -128,7 +128,7 @@ def check_size(smallest: tuple[int, int]) -> Iterator[Finding]:
 
 
 def looks_at(views: Sequence[Any], most: int, has_alpha: bool = True) -> list[Look]:
-    """Looks at views in a random order, since every second photo may be of another kind; fewer of large photos."""
+    """Reduce photos in a random order, since every second one may be of another kind; fewer if they are large."""
     order, looks, decoded = np.random.default_rng(0).permutation(len(views)), [], 0.0
     for number in order[:most]:
         try:
@@ -143,7 +143,7 @@ def looks_at(views: Sequence[Any], most: int, has_alpha: bool = True) -> list[Lo
 
 
 def _look(view: Any, has_alpha: bool) -> tuple[Look, float]:
-    """A view's photo, and the pixels that were decoded for it."""
+    """Reduce a view's photo; also return the number of pixels that were decoded."""
     if (image := getattr(view, "image", None)) is None:
         with open_image(Path(view.image_path)) as image:
             size, cost = image.size, image.width * image.height * (_JPEG if image.format == "JPEG" else 1)

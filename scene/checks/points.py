@@ -1,4 +1,4 @@
-"""Points that a training starts from: few, in no photo, far away, several in one place."""
+"""Checks of the points that a training starts from: few, in no photo, far away, several in one place."""
 
 from collections.abc import Iterator
 
@@ -7,7 +7,7 @@ import numpy as np
 from groundwork.finding import Finding, fine
 from groundwork.host.listing import some
 from scene.checks.cameras import OTHER_FORMS
-from scene.gaussians.copies import places_of
+from scene.gaussians.copies import clusters_of
 from scene.readers.info import SceneInfo, camera_centers
 from scene.readers.tracks import projected
 
@@ -22,7 +22,7 @@ _TESTS = 1_000_000  # and most tests
 
 
 def check_cloud(info: SceneInfo) -> Iterator[Finding]:
-    """Number of points."""
+    """Check the number of points."""
     text = f"{len(info.point_cloud.points)} points to start from"
     if len(info.point_cloud.points) < FEWEST_POINTS:
         more = "start from more points (--init_pcd_path), or reconstruct with more photos or features"
@@ -31,7 +31,7 @@ def check_cloud(info: SceneInfo) -> Iterator[Finding]:
         yield fine(text)
 
 
-def of_points(info: SceneInfo) -> Iterator[Finding]:
+def check_points(info: SceneInfo) -> Iterator[Finding]:
     """Check the points; find nothing where there are none, as for a loaded model, or random ones."""
     if info.point_cloud is None or not len(info.point_cloud.points) or info.has_random_points:
         return
@@ -40,15 +40,15 @@ def of_points(info: SceneInfo) -> Iterator[Finding]:
         return  # which is refused with the model's start
     yield from _far(points, info)
     yield from _unseen(points, info)
-    places = places_of(points)
-    if places.misleads:
+    places = clusters_of(points)
+    if places.hides_spacing:
         text = f"{places.shared:.0%} of the {len(points)} points share a place with others"
         text += f", up to {places.counts.max()} in one"
         yield Finding(text, "remove the copies from the cloud, as a program that merges clouds may have left them")
 
 
 def _far(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
-    """Points far behind all that is shown."""
+    """Find points far behind everything that the photos show."""
     away = np.linalg.norm(points - camera_centers(info.train_cameras).mean(axis=0), axis=1)
     far = (away > FAR_POINT * (info.extent or np.inf)).mean()
     if far > FAR_SHARE:
@@ -57,7 +57,7 @@ def _far(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
 
 
 def _unseen(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
-    """Points in no photo, and photos without points."""
+    """Find points in no photo, and photos without points."""
     count = min(_SAMPLE, max(200, _TESTS // len(info.train_cameras)))
     sample = points[:: max(1, len(points) // count)]
     seen = np.array([projected(camera, sample)[2] for camera in info.train_cameras])

@@ -1,4 +1,4 @@
-"""A scene, before a training and for doctor.py: its photos, cameras and points, in the order in which they explain."""
+"""All checks of a scene, before a training and for doctor.py, causes before their effects."""
 
 import argparse
 import contextlib
@@ -10,12 +10,12 @@ from itertools import chain
 from pathlib import Path
 
 from groundwork.finding import Finding, Severity, from_error, note
-from scene.checks.cameras import check_extent, check_lenses, of_cameras, of_lenses
-from scene.checks.conversion import changed_photos, check_conversion, left_out
+from scene.checks.cameras import check_cameras, check_extent, check_lens_shapes, check_lenses
+from scene.checks.conversion import check_conversion, describe_changed_photos, describe_left_out
 from scene.checks.fit import check_agreement, check_geometry
-from scene.checks.photo_files import of_blur, of_duplicates
+from scene.checks.photo_files import check_blur, check_duplicates
 from scene.checks.photos import SHARED_TEXT, check_photos, check_size, check_views
-from scene.checks.points import check_cloud, of_points
+from scene.checks.points import check_cloud, check_points
 from scene.dataset_readers import SceneInfo, read_scene
 from scene.readers.info import NEAREST, as_camera_info
 from scene.scene import Scene
@@ -29,7 +29,7 @@ _LINES = 5  # most findings that a training prints
 def findings(
     info: SceneInfo, options: argparse.Namespace | None = None, halves: bool = False, most: int = LOOKED_AT
 ) -> list[Finding]:
-    """Faults of the records that readers return, the worst first; none if nothing is wrong.
+    """Find faults of the records that readers return, the worst first.
 
     options: the model options of a training; code written for the reference lacks those that we added. halves: test
     views train, too, with their left halves. most: photos that are decoded.
@@ -37,8 +37,8 @@ def findings(
     alpha = getattr(options, "mask_meaning", "") != "none"
     train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
-    photos = [*check_photos(train, most, alpha), *of_duplicates(info, halves)]
-    found = [*of_cameras(info), *photos, *([] if has_shared_pixels(photos) else of_points(info))]
+    photos = [*check_photos(train, most, alpha), *check_duplicates(info, halves)]
+    found = [*check_cameras(info), *photos, *([] if has_shared_pixels(photos) else check_points(info))]
     return sorted(found, key=lambda one: -one.severity)
 
 
@@ -47,7 +47,7 @@ def has_shared_pixels(found: Sequence[Finding]) -> bool:
     return any(SHARED_TEXT in one.text for one in found)
 
 
-def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:
+def report(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -> None:
     """Raise the first finding as a UserError if it is hopeless; print a few as warnings. quiet: print none."""
     if found and found[0].severity == Severity.HOPELESS:
         raise UserError(str(found[0]))
@@ -62,15 +62,15 @@ def tell(found: list[Finding], source: str | os.PathLike, quiet: bool = False) -
 def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
     """Refuse a scene that cannot be trained (UserError), warn of its faults, and say where its frame is another.
 
-    A resumed training goes on with what its start was told of.
+    A resumed training goes on in spite of faults that its start was warned of.
     """
     info, views = scene.info, scene.getTrainCameras()
-    for text in filter(None, (left_out(options.source_path), changed_photos(options.source_path))):
+    for text in filter(None, (describe_left_out(options.source_path), describe_changed_photos(options.source_path))):
         print(text)
     if not resumed:
         smallest = min((view.image_width, view.image_height) for view in views)
         found = [*findings(info, options, scene.halves), *check_size(smallest)]
-        tell(found, options.source_path)
+        report(found, options.source_path)
     if info.offset.any():
         print(
             f"the scene's coordinates are large compared with its extent, so {tuple(info.offset.tolist())} is "
@@ -85,7 +85,7 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
 
 
 def check_dataset(source: str, images: str) -> list[Finding]:
-    """What doctor.py says of the scene in a folder. images: as train.py's -i."""
+    """Collect doctor.py's findings on the scene in a folder. images: as train.py's -i."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -95,13 +95,13 @@ def check_dataset(source: str, images: str) -> list[Finding]:
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
     found = findings(info, most=MOST_PHOTOS)
-    checks += [found, of_blur(info, MOST_PHOTOS)]
-    if not any(of_lenses(info)) and not has_shared_pixels(found):  # else poses have that cause
+    checks += [found, check_blur(info, MOST_PHOTOS)]
+    if not any(check_lens_shapes(info)) and not has_shared_pixels(found):  # else poses have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
     return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
 
 
 def _notes(said: str) -> list[Finding]:
-    """The messages that the readers printed, without progress bars."""
+    """Turn the messages that readers printed, without progress bars, into notes."""
     texts = [text.strip() for text in said.replace("\r", "\n").splitlines() if text.strip() and "%|" not in text]
     return [note(text) for text in texts]

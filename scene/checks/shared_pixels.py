@@ -1,6 +1,6 @@
 """Pixels that nearly all photos share: black corners, a caption, a logo, a bonnet, a still background of a turntable.
 
-A region of one colour may also be a plain background, which differs: its outline changes from photo to photo.
+A region of one colour may also be a plain background, but then its outline changes from photo to photo.
 """
 
 import numpy as np

@@ -21,7 +21,7 @@ _common = itemgetter("betas", "eps", "weight_decay", "amsgrad", "maximize", "cap
 
 
 class StepGuard:
-    """Stops all optimisers at the first iteration whose loss or whose step is not finite.
+    """Stops all optimisers at the first iteration whose loss or step is not finite.
 
     In that iteration, a value whose gradient or step is not finite keeps its value. Its exp_avg becomes NaN as a
     mark, which GaussianAdam.drop_marks removes. All other values take their step. In later iterations no value does.
@@ -201,7 +201,7 @@ class GaussianAdam(torch.optim.Adam):
         return self._active_columns.get(name, -1)
 
     def steps_all_by_kernel(self) -> bool:
-        """Whether the kernel steps every group, and no hook waits for a step."""
+        """Tell whether the kernel steps every group, and no hook waits for a step."""
         return not self._has_step_hooks() and not self._groups()[1]
 
     def state_of(self, param: Tensor) -> dict[str, Tensor]:
@@ -273,10 +273,10 @@ class SparseGaussianAdam(GaussianAdam):
 
 
 def undecorated(method: Callable) -> Callable:
-    """A method of torch's optimisers without the decorator that hides it from torch's compiler, unless that is loaded.
+    """Remove the decorator that hides a method of torch's optimisers from torch's compiler, unless that is loaded.
 
-    torch._disable_dynamo imports torch._dynamo, in one to five seconds, to tell it to leave the method alone. While
-    nobody has loaded the compiler, there is nobody to tell.
+    The decorator, torch._disable_dynamo, imports torch._dynamo, which takes one to five seconds and is useless while
+    the compiler is not loaded.
     """
     hidden = isinstance(method, FunctionType) and method.__globals__.get("__name__") == "torch._compile"
     return method.__wrapped__ if hidden and "torch._dynamo" not in sys.modules else method

@@ -56,7 +56,7 @@ def densify_and_prune(
     """Clone small and split large Gaussians with a mean gradient >= max_grad, then remove useless ones.
 
     min_opacity: a Gaussian below it is removed. extent: of the scene, world units. max_screen_size: pixels; unless
-    None, Gaussians wider than that or than a tenth of the extent are removed; none that is pinned is so for its width.
+    None, Gaussians wider than that or than a tenth of the extent are removed, except fixed ones.
     radii: (N,) pixels of this view, `tmp_radii` until the end. seed and iteration decide the positions of split
     children; without a seed, torch's generator draws one. max_splats > 0 bounds the number of Gaussians.
     """
@@ -83,14 +83,14 @@ def densify_and_prune(
         # Appending has just zeroed max_radii2D, so the first test never fires, as in the reference.
         remove |= gaussians.max_radii2D > max_screen_size
         large = ~rules.is_small(gaussians.log_scales(), rules.PRUNE_EXTENT * extent)
-        remove |= large if gaussians.pinned is None else large & ~gaussians.pinned(gaussians.raw("xyz"))
+        remove |= large if gaussians.fixed is None else large & ~gaussians.fixed(gaussians.raw("xyz"))
     gaussians.prune_points(remove)
     if radii is not None:
         gaussians.tmp_radii = None
 
 
 def _grows_by_own_steps(gaussians: GaussianParameters) -> bool:
-    """Whether nobody has replaced a step of density control, so that they may be taken together."""
+    """Tell whether all steps of density control are ours, so that they may be taken together."""
     own = densify_and_clone, densify_and_split, densification_postfix, prune_points
     return all(getattr(getattr(gaussians, step.__name__), "__func__", None) is step for step in own)
 
@@ -163,8 +163,8 @@ def _make_children(
     xyz, rotation = (rows[name][first : first + len(parents)] for name in ("xyz", "rotation"))
     shapes = xyz, gaussians.log_scales().index_select(0, parents), rotation
     if seed is None:
-        seed = gaussians.shards.ranks.shared(int(torch.randint(2**62, ())))
-    items = gaussians.shards.items(parents)
+        seed = gaussians.shards.ranks.broadcast_object(int(torch.randint(2**62, ())))
+    items = gaussians.shards.global_indices(parents)
     sampled = [
         rules.split_children(*shapes, items, child, count=count, seed=seed, iteration=iteration)
         for child in range(count)
@@ -182,7 +182,7 @@ def append_rows(gaussians: GaussianParameters, rows: Rows, *origins: Tensor) -> 
     if gaussians.tmp_radii is not None:
         standard.append(gaussians.tmp_radii.index_select(0, torch.cat(origins)))
     gaussians.densification_postfix(*standard, **rows)
-    gaussians.shards.order(*map(gaussians.shards.items, origins))
+    gaussians.shards.order_appended(*map(gaussians.shards.global_indices, origins))
 
 
 @changes_rows
@@ -207,7 +207,7 @@ def densification_postfix(
     if gaussians.tmp_radii is not None:
         new = gaussians.tmp_radii.new_zeros(len(new_xyz)) if new_tmp_radii is None else new_tmp_radii
         gaussians.tmp_radii = torch.cat((gaussians.tmp_radii, new))
-    gaussians.shards.appended(len(new_xyz))
+    gaussians.shards.note_appended(len(new_xyz))
     gaussians._zero_statistics()
 
 
@@ -227,7 +227,7 @@ def prune_points(gaussians: GaussianParameters, mask: Tensor) -> None:
     if len(keep) == len(kept):
         return
     gaussians._take(gaussians._prune_optimizer(kept))
-    gaussians.shards.kept(keep)
+    gaussians.shards.note_kept(keep)
     for name in PER_ROW:
         values = getattr(gaussians, name, None)  # users delete those that they do not need
         if values is not None:

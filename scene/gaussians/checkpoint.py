@@ -62,13 +62,13 @@ class State(NamedTuple):
 
 
 def capture(gaussians: GaussianParameters) -> tuple:
-    """Everything a resumed training needs, as tensors and numbers; `pack` gives the order.
+    """Collect everything that a resumed training needs, as tensors and numbers; `pack` gives the order.
 
     Values of Gaussians are parameters: the reference trains on with the very tensors that a checkpoint holds. Of
     several processes, all of which must call it, the first has the whole state, on the CPU, and others have no rows.
     """
     raw = {name: getattr(gaussians, a.field) for name, a in gaussians._attributes.items()}
-    gaussians.shards.match(gaussians.optimizer)
+    gaussians.shards.match_steps(gaussians.optimizer)
     state = State(
         gaussians.active_sh_degree,
         {name: x if isinstance(x, nn.Parameter) else nn.Parameter(x.detach()) for name, x in raw.items()},
@@ -77,7 +77,7 @@ def capture(gaussians: GaussianParameters) -> tuple:
         float(gaussians.spatial_lr_scale),
         gaussians.exposures.capture() if gaussians.exposures.trained else None,
     )
-    return pack(state.mapped(gaussians.shards.whole))
+    return pack(state.mapped(gaussians.shards.gather_whole))
 
 
 def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
@@ -86,7 +86,7 @@ def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_a
     A model without exposures takes those of the state, too; one that has them must have the same photos.
     UserError when the state was made with another maximal SH degree or does not fit together.
     """
-    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).mapped(gaussians.shards.own)
+    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).mapped(gaussians.shards.own_rows)
     gaussians.active_sh_degree = state.active_sh_degree
     gaussians.spatial_lr_scale = state.spatial_lr_scale
     gaussians.set_rows(state.rows)
@@ -135,12 +135,12 @@ def pack(state: State) -> tuple:
 
 
 def with_extra_state(entries: tuple, states: dict[str, Any]) -> tuple:
-    """The entries with extra state of a training in the optimiser's state dict, by its key."""
+    """Add extra state of a training to the optimiser's state dict, by key."""
     return (*entries[:_OPTIMIZER], entries[_OPTIMIZER] | states, *entries[_OPTIMIZER + 1 :])
 
 
 def extra_state(entries: Sequence[Any]) -> dict[str, Any]:
-    """What `with_extra_state` has added, and exposures; nothing more in a checkpoint of other code."""
+    """The state that `with_extra_state` has added, and exposures; only exposures in a checkpoint of other code."""
     optimizer, found = entries[_OPTIMIZER], _exposures_in(entries)
     extra = {} if found is None else {EXPOSURES: found}
     if not isinstance(optimizer, dict) or WRITTEN_BY not in optimizer:
@@ -214,7 +214,7 @@ def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> 
 
 
 def _reason(temporary: Path) -> OSError:
-    """Why no more can be written to a file, found out by writing more."""
+    """Find the reason why a file cannot be written, by writing more."""
     try:
         with open(temporary, "ab") as file:
             file.write(bytes(1 << 20))
@@ -274,7 +274,7 @@ def _in_short(value: Any) -> str:
 
 
 def _refuse_other_kinds(path: str | os.PathLike) -> None:
-    """UserError for what is given by mistake: a missing file, a model folder, a point cloud."""
+    """Raise UserError for other things given by mistake: a missing file, a model folder, a point cloud."""
     if os.path.isdir(path):
         raise UserError(f"--start_checkpoint {path} is a folder; give the file chkpntN.pth in it")
     if not os.path.isfile(path):

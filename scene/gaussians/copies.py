@@ -1,4 +1,4 @@
-"""Points of a cloud that lie in one place, exactly or but for rounding, as in clouds that were merged."""
+"""Clusters of points of a cloud in one place, exactly or within rounding, as in merged clouds."""
 
 from typing import NamedTuple
 
@@ -10,8 +10,8 @@ HIDING = 4  # points in one place: each has three neighbours at no distance, and
 _MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 
 
-class Places(NamedTuple):
-    """The places of a cloud: a point of each, by index (P,); the place of each point (N,); and points by place (P,)."""
+class Clusters(NamedTuple):
+    """The clusters of a cloud: a point's index for each (P,); each point's cluster (N,); points of each (P,)."""
 
     points: np.ndarray
     of_point: np.ndarray
@@ -19,17 +19,17 @@ class Places(NamedTuple):
 
     @property
     def shared(self) -> float:
-        """Share of the points that have others in their place."""
+        """Share of the points that are not alone in their cluster."""
         return float(self.counts[self.counts > 1].sum() / max(len(self.of_point), 1))
 
     @property
-    def misleads(self) -> bool:
-        """Whether distances between points say little of the distances between places."""
+    def hides_spacing(self) -> bool:
+        """True if distances between points say little about the distances between clusters."""
         return self.shared > MANY or int(self.counts.max(initial=0)) >= HIDING
 
 
-def places_of(points: np.ndarray) -> Places:
-    """The places of points (N, 3), which are finite. Two points are in one place if they are nearer than NEAR."""
+def clusters_of(points: np.ndarray) -> Clusters:
+    """Cluster points (N, 3), which are finite. Two points are in one cluster if they are nearer than NEAR."""
     points = np.asarray(points, dtype=np.float64)
     middle = np.median(points, axis=0) if len(points) else np.zeros(3)
     size = float(np.median(np.linalg.norm(points - middle, axis=1))) if len(points) else 0.0
@@ -37,13 +37,13 @@ def places_of(points: np.ndarray) -> Places:
     chosen, places = np.arange(len(points)), np.arange(len(points))
     for shift in (0.0, 0.5):  # a border of cells parts neighbours, but hardly two that are shifted against each other
         chosen, places = _merged(points, middle, cell, shift, chosen, places)
-    return Places(chosen, places, np.bincount(places, minlength=len(chosen)))
+    return Clusters(chosen, places, np.bincount(places, minlength=len(chosen)))
 
 
 def _merged(
     points: np.ndarray, middle: np.ndarray, cell: float, shift: float, chosen: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The places that are left when those in one cell of a grid are made one."""
+    """Merge the clusters in each cell of a grid."""
     cells = np.clip(np.floor((points[chosen] - middle) / cell + shift), -(2.0**62), 2.0**62).astype(np.int64)
     with np.errstate(over="ignore"):
         keys = (cells.view(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)

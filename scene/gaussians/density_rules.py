@@ -93,10 +93,10 @@ def actions(
 
 
 def reset_pays(step: int, opt: argparse.Namespace, stride: float = 1.0, of_white: bool = False) -> bool:
-    """Whether a model recovers from a reset at an iteration of the schedule, before the next one and before the end.
+    """Tell whether a model recovers from a reset at an iteration of the schedule before the next reset and the end.
 
-    With less than half an interval to go it keeps haze. of_white: the reset at densify_from_iter, where the interval
-    counts no more than the usual one, as a longer one is to mean no other resets.
+    With less than half an interval to go, haze remains. of_white: the reset at densify_from_iter; its interval is at
+    most the usual one, as a longer option only means that there are no other resets.
     """
     resets = opt.opacity_reset_interval
     half = (min(resets, USUAL_RESETS) if of_white else resets) / 2
@@ -126,19 +126,19 @@ def mean_gradient(accumulated: Tensor, count: Tensor) -> Tensor:
 def limit_growth(gradient: Tensor, threshold: float, most: int, shards: Shards = WHOLE) -> Tensor:
     """Zero the gradients of all candidates (>= threshold) except the `most` largest, ties by index: (N,)."""
     candidates = (gradient >= threshold).nonzero().reshape(-1)
-    if shards.ranks.before(len(candidates))[1] <= most:
+    if shards.ranks.offset_and_total(len(candidates))[1] <= most:
         return gradient
     grow = candidates[shards.lowest(gradient[candidates], most, highest=True)]
     return gradient.index_fill(0, candidates, 0.0).index_copy_(0, grow, gradient[grow])
 
 
 def is_small(scaling: Tensor, limit: float) -> Tensor:
-    """Whether the largest scale is <= limit (world units), from log scales (N, 3): (N,) bool."""
+    """Tell whether the largest scale is <= limit (world units), from log scales (N, 3): (N,) bool."""
     return scaling.amax(dim=1) <= _log(limit)
 
 
 def is_useless(opacity: Tensor, min_opacity: float) -> Tensor:
-    """Whether the opacity is below `min_opacity`, from logits (N, 1): (N,) bool."""
+    """Tell whether the opacity is below `min_opacity`, from logits (N, 1): (N,) bool."""
     return opacity.reshape(-1) < _logit(min_opacity)
 
 

@@ -26,14 +26,17 @@ _ADAM_EPS, _ADAM_RATE = 1e-8, 1e-3
 class Exposures:
     """Affine maps of colours, one per training photo: `values` (n, 3, 4) float32, [I | 0] at first.
 
-    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). mapping: index by the photo's name.
-    pretrained: None, or maps (3, 4) by name that are used in place of the values. optimizer: of the values, None before
-    training_setup. schedule: the learning rate by iteration. kind: of --appearance.
+    A pixel c, a row vector, becomes c A[:, :3] + A[:, 3] (`apply_exposure`). A part may use a subclass instead.
 
-    A part may put a subclass in their place. applied: whether a training compares renders as photos show them. held:
-    whether strategies have turned renders dark, so that nothing of photos should be learnt; these learn in any case, as
-    the reference's. shown: in place of `apply_exposure`, a render (3, H, W), not clamped, as the photo of a name shows
-    it.
+    mapping: index by the photo's name.
+    pretrained: None, or maps (3, 4) by name that are used in place of the values.
+    optimizer: the values' optimiser, None before training_setup.
+    schedule: the learning rate by iteration.
+    kind: value of --appearance.
+    applied: whether a training applies exposures to renders before it compares them with photos.
+    held: whether strategies have darkened renders, so that a subclass should not learn; this class learns in any case,
+    as the reference does.
+    shown: takes the place of `apply_exposure`: maps a render (3, H, W), not clamped, and a photo's name to an image.
     """
 
     kind: ClassVar[str] = "affine"
@@ -71,12 +74,12 @@ class Exposures:
         return sorted(self.mapping, key=self.mapping.__getitem__)
 
     def covers(self, name: str | None) -> bool:
-        """Whether every render of the view of that photo is as the photo shows it, without an option that asks."""
+        """Tell whether every render of that photo's view applies the exposure, without an option that asks for it."""
         return False
 
     @property
     def trained(self) -> bool:
-        """Whether they took a step of training, in this run or in the one it resumes."""
+        """True if the exposures took a step of training, in this run or in the one it resumes."""
         return self.optimizer is not None and bool(self.optimizer.state)
 
     def training_setup(self, opt: argparse.Namespace) -> None:
@@ -101,7 +104,7 @@ class Exposures:
             self.optimizer.param_groups[0]["lr"] = self.schedule(iteration)
 
     def keep_gradients(self) -> None:
-        """Let gradients lie in fixed places, where a recorded step writes them, and where `step` then finds them."""
+        """Keep gradients at fixed addresses, where a recorded step writes them and `step` reads them."""
         for group, gradient in zip(self.optimizer.param_groups, self._gradients, strict=True):
             group["params"][0].grad = gradient
 

@@ -21,8 +21,8 @@ def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) ->
     """
     for name, values in rows.items():
         finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(_PART)])
-        if shards.ranks.anyone(not finite.all()):
-            bad = shards.places(~finite)
+        if shards.ranks.any_rank(not finite.all()):
+            bad = shards.marked_indices(~finite)
             raise UserError(
                 f"{name} of {len(bad)} of {shards.total(len(values))} Gaussians in {where} is not finite "
                 f"(the first is Gaussian {int(bad[0])}); {remedy}"
@@ -30,7 +30,7 @@ def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) ->
 
 
 def with_scales(log_scales: Tensor) -> Tensor:
-    """Logarithms of scales (N, 2 or 3), raised to SMALLEST where they are those of 0, which is drawn as a tiny one."""
+    """Raise logarithms of scales (N, 2 or 3) of 0 to SMALLEST: a scale of 0 is drawn as a tiny one."""
     zero = log_scales == -math.inf
     return log_scales.masked_fill(zero, SMALLEST) if zero.any() else log_scales
 

@@ -1,4 +1,4 @@
-"""What PLYs of other programs say in columns of their own, or in other units than ours."""
+"""Columns of other programs' PLYs that we read or report, and values in other units than ours."""
 
 import math
 import os
@@ -10,7 +10,7 @@ from torch import Tensor
 
 from groundwork.deterministic.portable_math import exp, log
 from groundwork.files.ply_header import header_lines
-from groundwork.files.unread import say_once, say_unread
+from groundwork.files.unread import note_once, note_unread
 from scene.gaussians.attributes import Rows
 
 _FILTER = "filter_3D"  # the width of a Gaussian's filter, which Mip-Splatting and what follows it leave to the renderer
@@ -19,32 +19,32 @@ _LARGE = 0.01  # of the model's extent: a usual size that no trained model has
 _NO_LOGIT = 50.0  # beyond it, values are percent or bytes
 
 
-def as_others_mean(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, used: Collection[str]) -> Rows:
-    """Rows of a PLY with the 3D filter that it has beside them; lines tell of that, and of what is not used.
+def apply_foreign_filter(path: str | os.PathLike, rows: Rows, vertices: np.ndarray, used: Collection[str]) -> Rows:
+    """Apply a PLY's own 3D filter to its rows; print a line on that, and on columns that are not used.
 
-    A warning tells of values that are no logits or logarithms. used: names of the columns that the rows are from.
+    A warning is printed for values that are no logits or logarithms. used: names of the columns of the rows.
     """
     _warn_of_units(path, rows)
     names = set(vertices.dtype.names or ()) - set(used)
     if _FILTER in names and not vertices.dtype[_FILTER].hasobject and rows["scaling"].shape[1] == 3:
         names.remove(_FILTER)
-        say_once(
+        note_once(
             f"{path} has the 3D filter of Mip-Splatting ({_FILTER}), which is applied; its renders are right with "
             "--antialiasing"
         )
         widths = torch.from_numpy(np.asarray(vertices[_FILTER], np.float32).reshape(-1, 1).copy())
         opacity, scaling = _filtered(rows["opacity"], rows["scaling"], widths)
         rows = rows | {"opacity": opacity, "scaling": scaling}
-    say_unread(path, "ply", names)
+    note_unread(path, "ply", names)
     elements = {words[1] for line in header_lines(path) if len(words := line.split()) == 3 and words[0] == "element"}
-    say_unread(path, "ply elements", elements - {"vertex"})
+    note_unread(path, "ply elements", elements - {"vertex"})
     if any(name.startswith(_MOVING) for name in names) or any(name.startswith("delta_") for name in elements):
-        say_once(f"warning: {path} is a model that moves, of which only one state is drawn; some of it may look wrong")
+        note_once(f"warning: {path} is a model that moves, of which only one state is drawn; some of it may look wrong")
     return rows
 
 
 def _filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
-    """Logits (N, 1) and log scales (N, 3) behind the filter of `widths` (N, 1) of Mip-Splatting (Yu et al. 2024).
+    """Apply the filter of `widths` (N, 1) of Mip-Splatting (Yu et al. 2024) to logits (N, 1) and log scales (N, 3).
 
     Variances grow by that of the filter, and the opacity falls with the square root of the covariance's determinant.
     """
@@ -58,9 +58,9 @@ def _filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tenso
 
 
 def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:
-    """Warn of opacities, colours and scales as they are drawn, instead of logits, SH coefficients and logarithms.
+    """Warn if opacities, colours and scales seem to be plain values, no logits, SH coefficients and logarithms.
 
-    A trained model has faint and dark Gaussians, whose values are below 0, and sizes far below its extent.
+    A trained model has faint and dark Gaussians, with values below 0, and sizes far below its extent.
     """
     if not len(rows["xyz"]):
         return
@@ -69,10 +69,10 @@ def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:
         low, high = float(rows[part].min()), float(rows[part].max())
         if low >= 0 and (0 < high <= 1 or _NO_LOGIT < high < math.inf):
             found = f"{what} of {path} are from {low:.3g} to {high:.3g}"
-            say_once(f"warning: all {found}, so they may be no {form}; {remedy}")
+            note_once(f"warning: all {found}, so they may be no {form}; {remedy}")
     scales = rows["scaling"]
     if scales.min() >= 0 and scales.max() > 0 and float(scales.median().exp()) > _LARGE * _extent(rows["xyz"]):
-        say_once(f"warning: all scales of {path} are above 0, so they may be no logarithms; {remedy}")
+        note_once(f"warning: all scales of {path} are above 0, so they may be no logarithms; {remedy}")
 
 
 def _extent(points: Tensor) -> float:

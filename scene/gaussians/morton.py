@@ -1,7 +1,7 @@
-"""The order of rows: along a Morton curve of the means, so that neighbours in the scene are neighbours in memory.
+"""Sort rows along a Morton curve of the means, so that neighbours in the scene are neighbours in memory.
 
-Kernels then read the rows of a tile's splats, and write their gradients, in few places. Any order gives the same model
-up to the rounding of sums.
+Kernels then read and write the rows of a tile's splats in few places. Any order gives the same model up to the rounding
+of sums.
 """
 
 import torch

@@ -17,7 +17,7 @@ from groundwork.ranks.rows import WHOLE, Divided, Shards
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, frame_comments, read_ply, row_bytes, write_ply
-from scene.gaussians.spilled import Room, empty_for, is_spilled, to_host
+from scene.gaussians.spilled import Storage, empty_for, is_spilled, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
@@ -36,7 +36,7 @@ def covariance(scaling: Tensor, scaling_modifier: float, rotation: Tensor) -> Te
 def raw_rows(gaussians: "GaussianParameters") -> Rows:
     """Raw values by optimiser group, without gradient; they share the parameters' memory.
 
-    A function, so that it means the same for a subclass that has a method `rows` of its own.
+    A function and no method, so that a subclass with a method `rows` of its own changes nothing.
     """
     return {name: getattr(gaussians, a.field).detach() for name, a in gaussians._attributes.items()}
 
@@ -50,8 +50,8 @@ class GaussianParameters:
     are enlarged where they are drawn (scene/readers/tracks.py). Activations are attributes, which
     `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
-    these rows are among those of all ranks, if several have a part of the model each. room: where rows lie.
-    pinned: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
+    these rows are among those of all ranks, if several have a part of the model each. storage: where rows lie.
+    fixed: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
     present view, or None; density control keeps it in step with the rows. columns: further values
@@ -64,8 +64,8 @@ class GaussianParameters:
     world_offset = (0.0, 0.0, 0.0)
     enlargement = 1.0
     shards: Shards = WHOLE
-    room: Room = Room()
-    pinned: Callable[[Tensor], Tensor] | None = None
+    storage: Storage = Storage()
+    fixed: Callable[[Tensor], Tensor] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
     columns: dict[str, Tensor] = MappingProxyType({})
@@ -186,9 +186,9 @@ class GaussianParameters:
 
     @property
     def kernels_activate(self) -> bool:
-        """Whether the rasterizer's kernels activate `raw_geometry()` as this model does.
+        """True if the rasterizer's kernels activate `raw_geometry()` as this model does.
 
-        They do not once an activation was replaced, or a getter of opacities, scales or rotations overridden.
+        False once an activation was replaced, or a getter of opacities, scales or rotations overridden.
         """
         kind = type(self)
         return (
@@ -200,7 +200,7 @@ class GaussianParameters:
 
     @property
     def features_are_raw(self) -> bool:
-        """Whether the getters of SH coefficients give the raw ones; not if a subclass overrides one of them."""
+        """True if the getters of SH coefficients give the raw ones; not if a subclass overrides one of them."""
         kind = type(self)
         return (kind.get_features, kind.get_features_dc, kind.get_features_rest) == _FEATURES
 
@@ -232,7 +232,7 @@ class GaussianParameters:
 
     @property
     def keeps_logits(self) -> bool:
-        """Whether raw opacities are logits, in both directions."""
+        """True if raw opacities are logits, in both directions."""
         return self.kernels_activate and self.inverse_opacity_activation is inverse_sigmoid
 
     def raw_opacity(self, logits: Tensor) -> Tensor:
@@ -265,7 +265,7 @@ class GaussianParameters:
 
     @property
     def frame(self) -> dict[str, Any]:
-        """What model.json keeps of the frame of the coordinates."""
+        """The entries of model.json on the frame of the coordinates."""
         return {"world_offset": self.world_offset, "enlargement": self.enlargement}
 
     def save_ply(self, path: str | os.PathLike) -> None:
@@ -311,12 +311,12 @@ class GaussianParameters:
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
         self.columns = {}
-        self.shards = self.shards.of(len(self))
+        self.shards = self.shards.resized(len(self))
         self._zero_statistics()
 
     def take_whole(self, rows: Rows) -> None:
         """Do as set_rows with the rows of a whole model, of which this rank keeps its part."""
-        self.set_rows({name: self.shards.own(values) for name, values in rows.items()})
+        self.set_rows({name: self.shards.own_rows(values) for name, values in rows.items()})
 
     def _take(self, params: dict[str, Tensor]) -> None:
         """Set the tensors of these attributes; tensors of other names are not the table's."""

@@ -15,8 +15,8 @@ class Penalty(NamedTuple):
     opacity: float = 0.0
     scale: float = 0.0
 
-    def of_each(self, count: int) -> "Penalty":
-        """The weights of one opacity and of one of the three scales, among `count` Gaussians."""
+    def per_value(self, count: int) -> "Penalty":
+        """The weights of a single opacity and of a single one of the three scales, among `count` Gaussians."""
         return Penalty(self.opacity / max(count, 1), self.scale / max(3 * count, 1))
 
 
@@ -33,7 +33,7 @@ def penalise(gaussians: GaussianParameters, penalty: Penalty) -> None:
     for param in params:
         if param.grad is None:
             param.grad = torch.zeros_like(param)
-    each = penalty.of_each(gaussians.gaussian_count)
+    each = penalty.per_value(gaussians.gaussian_count)
     gradients = [param.grad.contiguous() for param in params]
     penalise_(*(param.detach() for param in params), *gradients, opacity=each.opacity, scale=each.scale)
     for param, gradient in zip(params, gradients, strict=True):

@@ -16,7 +16,7 @@ from groundwork.files.ply_header import read_elements
 from groundwork.ranks.rows import WHOLE, Shards
 from scene.gaussians.attributes import IN_CHECKPOINT, Rows, attributes
 from scene.gaussians.finite import with_scales
-from scene.gaussians.foreign import as_others_mean
+from scene.gaussians.foreign import apply_foreign_filter
 from utils.system_utils import UserError, atomic_write, writes_files
 
 FLAT = "flat Gaussians of two scales (2DGS), which this rasterizer cannot draw; give a 3DGS model"
@@ -98,11 +98,11 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
     flat: take Gaussians of two scales, too, for models that draw them by other code. further: read attributes beyond
     the paper's six, too.
 
-    SH bands that the file lacks are zero: the last save of a training leaves out those that are. Bands above degree 3
-    are left out, with a warning. Scales of 0 become tiny (`with_scales`). What other programs mean in other ways is
-    taken so, or told (`as_others_mean`). Names may begin with scalar_, as CloudCompare writes them. sh_degree: None:
-    that of the file, up to 3. UserError when the file is missing or unreadable, lacks properties (the message names
-    them), or has a higher degree.
+    SH bands that the file lacks are zero: the last save of a training leaves out zero bands. Bands above degree 3 are
+    left out, with a warning. Scales of 0 become tiny (`with_scales`). A 3D filter of other programs is applied, and
+    unused columns are reported (`apply_foreign_filter`). Names may begin with scalar_, as CloudCompare writes them.
+    sh_degree: None: the file's, up to 3. UserError when the file is missing or unreadable, lacks properties (the
+    message names them), or has a higher degree.
     """
     vertices = _as_named(read_vertices(path))
     present = {name for name in vertices.dtype.names or () if not vertices.dtype[name].hasobject}  # no list
@@ -131,7 +131,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
             values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
         rows[name] = values
     rows["scaling"] = with_scales(rows["scaling"])
-    rows = as_others_mean(path, rows, vertices, {name for columns in parts.values() for name in columns})
+    rows = apply_foreign_filter(path, rows, vertices, {name for columns in parts.values() for name in columns})
     absent = attributes(sh_degree)["f_rest"].shape[0] - rows["f_rest"].shape[1]
     rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
     return rows

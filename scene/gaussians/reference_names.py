@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from scene.gaussians.attributes import Rows
 
 
-def _of_exposures(name: str, doc: str) -> property:
+def _delegate(name: str, doc: str) -> property:
     """A part of a model's exposures, by the reference's name."""
     return property(
         lambda self: getattr(self.exposures, name), lambda self, value: setattr(self.exposures, name, value), doc=doc
@@ -20,11 +20,11 @@ class ReferenceNames:
     table: Any
     exposures: Any
 
-    _exposure = _of_exposures("values", "Maps of colours (n, 3, 4) of the n training photos.")
-    exposure_mapping = _of_exposures("mapping", "Index in `get_exposure` by the photo's name.")
-    pretrained_exposures = _of_exposures("pretrained", "Maps (3, 4) by name that replace the trained ones, or None.")
-    exposure_optimizer = _of_exposures("optimizer", "The optimiser of the exposures; None before training is set up.")
-    exposure_scheduler_args = _of_exposures("schedule", "Learning rate by iteration; None before training is set up.")
+    _exposure = _delegate("values", "Maps of colours (n, 3, 4) of the n training photos.")
+    exposure_mapping = _delegate("mapping", "Index in `get_exposure` by the photo's name.")
+    pretrained_exposures = _delegate("pretrained", "Maps (3, 4) by name that replace the trained ones, or None.")
+    exposure_optimizer = _delegate("optimizer", "The optimiser of the exposures; None before training is set up.")
+    exposure_scheduler_args = _delegate("schedule", "Learning rate by iteration; None before training is set up.")
 
     @property
     def get_exposure(self) -> Tensor:

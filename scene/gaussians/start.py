@@ -7,7 +7,7 @@ import torch
 from simple_knn._C import distCUDA2
 
 from scene.gaussians.attributes import Rows, attributes
-from scene.gaussians.copies import places_of
+from scene.gaussians.copies import clusters_of
 from utils.graphics_utils import BasicPointCloud
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
@@ -48,12 +48,12 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int, enlargemen
 def _initial_scales(points: np.ndarray, extent: float, enlargement: float) -> np.ndarray:
     """Scales (N,) float32, world units: the root mean squared distance to the three nearest neighbours.
 
-    Neighbours are in other places, where so many points share one that their distances would say nothing.
+    Neighbours are sought in other clusters of points if distances within clusters would say nothing.
     """
     if len(points) < 4:
         return np.full(len(points), LONE_POINT_SCALE * max(extent, 1e-3 / enlargement), dtype=np.float32)
-    places = places_of(points)
-    if places.misleads:
+    places = clusters_of(points)
+    if places.hides_spacing:
         return _initial_scales(points[places.points], extent, enlargement)[places.of_point]
     scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2 / enlargement**2)))
     return _without_outliers(scale, extent)

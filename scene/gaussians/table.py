@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from groundwork.host.memory import is_out_of_memory
 from scene.gaussians.attributes import Rows
-from scene.gaussians.spilled import empty_for, empty_spilled_as, placed
+from scene.gaussians.spilled import empty_for, empty_spilled_as, to_storage
 from scene.gaussians.statistics import PER_ROW
 
 Group = dict[str, Any]  # a parameter group of a torch optimiser: `params`, options, and maybe `name`
@@ -97,10 +97,10 @@ class GaussianTable:
         for group in (*self.optimised, *self.others):
             if group.get("name") == name:
                 shape = group["params"][0].shape
-                zeros = lambda mean, shape=shape: placed(  # noqa: E731
+                zeros = lambda mean, shape=shape: to_storage(  # noqa: E731
                     self._model, name, torch.zeros_like(value if mean.shape == shape else mean)
                 )
-                params[name] = self._replace(group, placed(self._model, name, value), zeros)
+                params[name] = self._replace(group, to_storage(self._model, name, value), zeros)
         return params
 
     @torch.no_grad()
@@ -133,9 +133,9 @@ class GaussianTable:
         params = {}
         for group in groups:
             name, old = group.get("name"), group["params"][0].detach()
-            value = placed(self._model, name, change(old, name, False))
+            value = to_storage(self._model, name, change(old, name, False))
             del old  # whose memory the averages may need
-            changed = lambda mean, name=name: placed(self._model, name, change(mean, name, True))  # noqa: E731
+            changed = lambda mean, name=name: to_storage(self._model, name, change(mean, name, True))  # noqa: E731
             params[name] = self._replace(group, value, changed, takes=True)
         return params
 

@@ -10,9 +10,9 @@ import torch
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from groundwork.files.color_profiles import has_other_colors, in_srgb
-from groundwork.files.image_files import MOST_PIXELS, UNREADABLE, eight_bits, open_image, sixteen_bits
-from groundwork.files.plain_files import not_the_file
+from groundwork.files.color_profiles import has_other_colors, to_srgb
+from groundwork.files.image_files import MOST_PIXELS, UNREADABLE, open_image, to_eight_bits, to_sixteen_bits
+from groundwork.files.plain_files import describe_wrong_file
 from groundwork.host.listing import some
 from utils.system_utils import UserError
 
@@ -60,7 +60,7 @@ def picture_sizes(paths: Sequence[Path]) -> list[tuple[int, int]]:
 
 
 def may_be_transparent(path: Path) -> bool:
-    """Whether a readable image file has an alpha channel or a transparent colour, from its header."""
+    """Tell whether a readable image file has an alpha channel or a transparent colour, from its header."""
     with open_image(path) as image:
         return image.has_transparency_data
 
@@ -86,7 +86,7 @@ def grey_values(path: Path) -> np.ndarray:
     try:
         with open_image(path) as image:
             if image.mode.startswith("I"):
-                return np.asarray(sixteen_bits(image))
+                return np.asarray(to_sixteen_bits(image))
             image.info.pop("icc_profile", None)  # its values are no colours
             pixels = pixels_of(image, image.size).numpy()
     except (*UNREADABLE, MemoryError) as error:
@@ -111,7 +111,7 @@ def pixels_of(image: Image.Image, size: tuple[int, int], opaque: bool = False) -
 
 
 def _unreadable(path: Path, error: Exception) -> UserError:
-    if other := not_the_file(path):
+    if other := describe_wrong_file(path):
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
     if isinstance(error, Image.DecompressionBombError):
         return UserError(f"{path} has more than {MOST_PIXELS:,} pixels; make it smaller")
@@ -138,8 +138,8 @@ def _refuse_float(image: Image.Image) -> None:
 
 def _to_rgb_or_rgba(image: Image.Image, opaque: bool) -> Image.Image:
     _refuse_float(image)
-    image = in_srgb(image)
+    image = to_srgb(image)
     if image.mode.startswith("I"):
-        return eight_bits(image).convert("RGB")
+        return to_eight_bits(image).convert("RGB")
     has_alpha = image.has_transparency_data and not opaque
     return image.convert("RGBA" if has_alpha else "RGB")

@@ -1,4 +1,4 @@
-"""What a photo's EXIF data, and DJI's XMP, tell: the lens that took it, where it was taken, and which way was down."""
+"""Lens, place and vertical of a photo, from its EXIF data and DJI's XMP."""
 
 import math
 import re
@@ -22,9 +22,9 @@ _UPRIGHT = {1: (1, 0, 0, 1), 3: (-1, 0, 0, -1), 6: (0, -1, 1, 0), 8: (0, 1, -1, 
 
 
 class Lens(NamedTuple):
-    """What EXIF says: names, focal lengths (mm) of the lens and of one on 35 mm film, digital zoom; "" and 0 if not.
+    """EXIF data of a lens: names, focal lengths (mm), real and on 35 mm film, digital zoom; "" and 0 if missing.
 
-    Photos of equal records went through one lens: a phone that crops for its 2x says so by `film` or by `zoom`.
+    Photos with equal records were taken by one lens: a phone that crops for its 2x records that in `film` or `zoom`.
     """
 
     make: str = ""
@@ -35,8 +35,8 @@ class Lens(NamedTuple):
     zoom: float = 0.0
 
     @property
-    def tells_apart(self) -> bool:
-        """Whether the record tells lenses of one device apart."""
+    def is_distinct(self) -> bool:
+        """True if the record tells lenses of one device apart."""
         return bool(self.lens or self.focal or self.film)
 
     @property

@@ -1,4 +1,4 @@
-"""How photos differ, by the points that they have in common: what a photo shows does not count."""
+"""Exposures of photos, by the points that they have in common, so that the content of a photo does not count."""
 
 from collections.abc import Sequence
 
@@ -22,7 +22,7 @@ def exposures(colors: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.
 
 
 def _levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.ndarray:
-    """What N photos add to values (K,) of their points, around its mean (N,): a robust fit of photo plus point."""
+    """Fit values (K,) of each photo's points robustly by photo plus point; return the photos' terms (N,), of mean 0."""
     value, photo = np.concatenate(values), np.repeat(np.arange(len(values)), [len(one) for one in values])
     point = np.unique(np.concatenate(points), return_inverse=True)[1]
     weight = np.ones(len(value))
@@ -36,9 +36,9 @@ def _levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.nd
 def _fitted(
     values: np.ndarray, weight: np.ndarray, photo: np.ndarray, point: np.ndarray, photos: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What photos (photos,) and points add, whose sums are nearest to values (K,), by weighted least squares.
+    """Fit values (K,) by a term for each photo (photos,) and each point, by weighted least squares.
 
-    Points are eliminated (Triggs et al. 2000, section 6.1). To fit both by turns would take as many rounds as a walk
+    Points are eliminated (Triggs et al. 2000, section 6.1): fits of both in turns would take as many rounds as a walk
     has photos.
     """
     from scipy import sparse  # it takes a while to import
@@ -54,5 +54,5 @@ def _fitted(
 
 
 def _linear(values: np.ndarray) -> np.ndarray:
-    """sRGB to light (IEC 61966-2-1)."""
+    """Convert sRGB to linear light (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)

@@ -1,8 +1,7 @@
 """Search for the files that a dataset names, and for those beside its photos, such as masks and depth maps.
 
 Files beside photos are found, and written, below a folder by the photos' names. A dataset may name a photo by an
-absolute path, or through parent folders. Such a name says where the photo is. It never leads out of the folder of the
-files beside it.
+absolute path, or through parent folders; such a name never leads out of the folder of the side files.
 """
 
 import filecmp
@@ -72,7 +71,7 @@ class FileIndex:
         return [path for suffix in SUFFIXES for path in self._folded.get(stem + suffix, [])]
 
     def description(self) -> str:
-        """What the folder has, in brackets."""
+        """The contents of the folder, in brackets, for messages."""
         there = sorted(str(path.relative_to(self._folder)) for paths in self._folded.values() for path in paths)
         return f" (the folder has {some(there)})" if there else " (the folder is empty)"
 
@@ -243,7 +242,7 @@ class SideFiles:
         (self.elsewhere[self.names[place]],) = alike
         return self.elsewhere[self.names[place]]
 
-    def tell_elsewhere(self, kind: str) -> None:
+    def report_elsewhere(self, kind: str) -> None:
         """Say which files were found by their bare names only. kind: plural, as "masks"."""
         if self.elsewhere:
             name, path = next(iter(self.elsewhere.items()))
@@ -269,7 +268,7 @@ def _stem(name: str) -> str:
 
 
 def identity(path: str | Path | None) -> tuple[int, int] | None:
-    """What tells a file from others, by whatever name; None where there is none."""
+    """The identity of a file under any name; None if the file is missing."""
     try:
         info = os.stat(path or "")
     except OSError:

@@ -129,7 +129,7 @@ def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], n
 @functools.lru_cache(maxsize=4096)
 @np.errstate(all="ignore")
 def _is_plausible(lens: Lens, focal: float) -> bool:
-    """Whether a lens shows each direction once, and nearly where it would without distortion.
+    """Tell whether a lens shows each direction once, and nearly where it would without distortion.
 
     Directions of the circle that touches the photo's nearer sides are asked for; beyond it, many calibrated polynomials
     turn back. So do those of fisheyes behind the edge of a smaller picture.

@@ -49,12 +49,12 @@ class MaskOptions:
 
     @property
     def ignore_alpha(self) -> bool:
-        """Whether transparent pixels of a photo are ignored."""
+        """True if transparent pixels of a photo are ignored."""
         return self.meaning == IGNORE
 
     @property
     def drop_alpha(self) -> bool:
-        """Whether photos count as opaque."""
+        """True if photos count as opaque."""
         return self.meaning == NONE
 
     def mask(self, path: Path) -> "Mask":
@@ -201,7 +201,7 @@ def find_masks(
     if lacking:
         said = f"{len(lacking)} of {len(names)} photos have no mask; all their pixels count: {some(lacking)}"
         print(said, file=sys.stderr)
-    files.tell_elsewhere("masks")
+    files.report_elsewhere("masks")
     return [None if path is None else options.mask(path) for path in found]
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from groundwork.host.machine import threads
 from groundwork.host.memory import free_memory
 from groundwork.ranks.ranks import ALONE, Ranks
-from groundwork.ranks.shared_images import SharedImage, divided
+from groundwork.ranks.shared_images import SharedImage, share_images
 from scene.images.decode import decode
 
 GPU_SHARE = 0.25  # of a GPU's free memory at the start that images may take; the model needs the rest
@@ -45,16 +45,16 @@ class InMemory:
 
     pixels: Tensor
 
-    def changed(self, change: Callable[[Tensor], Tensor]) -> "InMemory":
-        """Another image, made of this one now."""
+    def transformed(self, change: Callable[[Tensor], Tensor]) -> "InMemory":
+        """Make another image of this one, now."""
         return InMemory(change(self.pixels))
 
     def __deepcopy__(self, memo: dict) -> "InMemory":
         return self  # never changed in place, so that copies of a camera can share it
 
 
-def at_hand(source: Any) -> bool:
-    """Whether an image has its pixels, in memory or shared by processes, so that no store has to look for it."""
+def has_pixels(source: Any) -> bool:
+    """Tell whether an image has its pixels, in memory or shared by processes, so that no store is needed."""
     return hasattr(source, "pixels")
 
 
@@ -106,7 +106,7 @@ class ImageStore:
         self._planned = set(keys)
         if self.ranks.several:
             sizes = {key: _bytes(*key) for key in keys}
-            self._planned, self._shared = divided(sizes, self._own, self.device, self.ranks)
+            self._planned, self._shared = share_images(sizes, self._own, self.device, self.ranks)
         self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0
@@ -133,7 +133,7 @@ class ImageStore:
 
     @property
     def keeps_floats(self) -> bool:
-        """Whether images may also be kept as float32, four times as large, on the device of --data_device."""
+        """True if images may also be kept as float32, four times as large, on the device of --data_device."""
         return not self.limit and self._floats_fit and not self.ranks.several
 
     def get(self, source: Source, size: Size) -> Tensor:
@@ -144,10 +144,10 @@ class ImageStore:
         key = _key(source, size)
         return self._shared[key].pixels if key in self._shared else self._own(key)
 
-    def changed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory:
-        """An image made of another, of which the store keeps nothing: now, or by one process for all that share it."""
+    def transformed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory:
+        """Make an image of another one, which the store does not keep: now, or in one process for all that share it."""
         shared = self._shared.get(_key(source, size))
-        return InMemory(change(self.get(source, size))) if shared is None else shared.changed(change)
+        return InMemory(change(self.get(source, size))) if shared is None else shared.transformed(change)
 
     def _own(self, key: Key) -> Tensor:
         picture = self._kept.get(key)
@@ -198,7 +198,7 @@ class ImageStore:
         return len(self._kept)
 
     def _finished(self, key: Key) -> Tensor:
-        """Keep an image on `keep_on` once a thread has decoded it; if none is at it, decode it here."""
+        """Wait for the thread that decodes an image, or decode it here if none does; keep it on `keep_on`."""
         future = self._kept.pop(key, None)
         if future is None:
             self._drop_oldest()

@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from scene.colmap_loader import Camera, Image, Points, qvec2rotmat, read_cameras, read_images, read_points
 from scene.images.find import find_images
 from scene.images.lens import Lens
 from scene.images.masks import NO_MASKS, Mask, MaskOptions, find_masks
 from scene.readers.holdout import EVERY, refuse_rule, split
 from scene.readers.info import CameraInfo, Posed, SceneInfo
-from scene.readers.photos import camera_info, finished
+from scene.readers.photos import camera_info, to_pinholes
 from scene.readers.point_cloud import check_finite, read_point_cloud
 from scene.readers.scene_folder import REPORT
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
@@ -51,7 +51,7 @@ def read_colmap(
     Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
     model_folder, model = find_model(folder)
-    say_unread(model_folder, "colmap", _side_files(model_folder))
+    note_unread(model_folder, "colmap", _side_files(model_folder))
     if (listed := model_folder / "test.txt").is_file():  # of the reference, whose train.py does not read it either
         refuse_rule(rule, listed)
     if not model.images:
@@ -78,7 +78,7 @@ def read_colmap(
         colmap_camera(photo, model.cameras[photo.camera_id], path, mask, masks.ignore_alpha, native)
         for photo, path, mask in zip(photos, paths, found, strict=True)
     ]
-    views = split(finished(cameras, masks.drop_alpha), hold_out, rule, folder)
+    views = split(to_pinholes(cameras, masks.drop_alpha), hold_out, rule, folder)
     own, lacking = partial(_own_cloud, model_folder, model), f"{listed_by} has no points"
     return scene_info(views, start, own, partial(random_in_frusta, views[0]), lacking)
 
@@ -216,7 +216,7 @@ def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) 
 
 
 def _file(folder: Path, name: str, suffix: str) -> Path | None:
-    """A file of a model, of this kind if there is one, else of the other; None if there is neither."""
+    """Find a file of a model, of this kind if there is one, else of the other; None if there is neither."""
     paths = (folder / f"{name}.{kind}" for kind in sorted(_SUFFIXES, key=lambda kind: kind != suffix))
     return next((path for path in paths if path.is_file()), None)
 
@@ -234,5 +234,5 @@ def _side_files(folder: Path) -> set[str]:
 
 
 def _lacking(folder: Path) -> list[str]:
-    """What a folder lacks of what every model has."""
+    """The files of a model that a folder lacks."""
     return [name for name in _NEEDED if not _file(folder, name, "bin")]

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from groundwork.files.image_files import UNREADABLE, open_image, plane_scale
-from groundwork.files.plain_files import plain, plain_text
+from groundwork.files.plain_files import plain_path, plain_text
 from groundwork.host.listing import some
 from groundwork.host.machine import threads
 from scene.images.decode import picture_size
@@ -59,10 +59,10 @@ class DepthMap:
     def decode(self, size: tuple[int, int]) -> Tensor:
         """Inverse depth (1, H, W) float32 at a size (width, height). UserError for a file that cannot be read."""
         values = read_values(self.path) / self.unit
-        return fitted(inverses(values) if self.metric else values, size, self.scale, self.offset)
+        return apply_fit(inverses(values) if self.metric else values, size, self.scale, self.offset)
 
     def has_depth(self) -> bool:
-        """Whether any value of the file tells a depth. UserError for a file that cannot be read."""
+        """Tell whether any value of the file is a depth. UserError for a file that cannot be read."""
         values = read_values(self.path) / self.unit
         return bool((np.isfinite(inverses(values)) if self.metric else values > 0).any())
 
@@ -74,10 +74,11 @@ class Metric(NamedTuple):
     scale: float | None
 
     @classmethod
-    def of(cls, folder: Path) -> "Metric | None":
-        """Units as the file METRIC tells them; None for a folder of inverse depth. UserError for a broken file.
+    def from_folder(cls, folder: Path) -> "Metric | None":
+        """Read units from the file METRIC; None for a folder of inverse depth. UserError for a broken file.
 
-        Metric are .npy and .pfm in a folder without a PNG, and PNGs beside a file METRIC that tells their step.
+        Maps are metric if they are .npy or .pfm in a folder without a PNG, or PNGs beside a file METRIC with their
+        step.
         """
         path, suffixes = folder / METRIC, {file.suffix.lower() for file in files_below(folder)}
         try:
@@ -153,10 +154,10 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
             f"maps are not ({some(undistorted)}); undistort the scene with `colmap image_undistorter`, and make "
             "maps of the undistorted photos"
         )
-    metric, is_colmap = Metric.of(folder), (scene / "sparse").is_dir()
+    metric, is_colmap = Metric.from_folder(folder), (scene / "sparse").is_dir()
     files = _files(info.train_cameras, scene, folder, is_colmap)
     paths = [files.find(place, map_names(metric)) for place in range(len(info.train_cameras))]
-    files.tell_elsewhere("depth maps")
+    files.report_elsewhere("depth maps")
     if metric:
         cameras = _with_metric_maps(info.train_cameras, paths, scene, folder, metric)
     else:
@@ -186,7 +187,7 @@ def _files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: 
 
 
 def _with_depth(cameras: list[CameraInfo], folder: Path) -> list[CameraInfo]:
-    """The views without the maps that tell no depth, which a message names. UserError if all are such."""
+    """Remove maps without any depth from the views; a message names them. UserError if all are such."""
     views = [camera for camera in cameras if camera.depth]
     with ThreadPoolExecutor(threads()) as pool:
         told = pool.map(lambda view: view.depth.has_depth(), views)
@@ -240,7 +241,7 @@ def read_values(path: Path) -> np.ndarray:
 
 def _array(path: Path) -> np.ndarray:
     """The floats (H, W) of a .npy, which stay in the file. ValueError for other arrays."""
-    values = np.load(plain(path), mmap_mode="r", allow_pickle=False)
+    values = np.load(plain_path(path), mmap_mode="r", allow_pickle=False)
     if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f":
         raise ValueError("it is no array (height, width) of floats")
     return values
@@ -272,7 +273,7 @@ def _is_16_bit_color(path: Path) -> bool:
     return header.startswith(b"\x89PNG") and len(header) == 26 and header[24] == 16 and header[25] in (2, 6)
 
 
-def fitted(values: np.ndarray, size: tuple[int, int], scale: float, offset: float) -> Tensor:
+def apply_fit(values: np.ndarray, size: tuple[int, int], scale: float, offset: float) -> Tensor:
     """Inverse depth (1, H, W) float32 at a size (width, height) of a map's values (h, w); those below 0 count as 0."""
     values = np.maximum(resize(values, size), 0.0) * scale + offset
     return torch.from_numpy(values.astype(np.float32))[None]

@@ -1,4 +1,4 @@
-"""Which photos are held out to test a model (--eval): every eighth (--holdout every8), a sector or a block of them.
+"""Choice of test photos (--eval): every eighth (--holdout every8), a sector or a block.
 
 Every eighth photo has trained neighbours close by, which flatters a model; a sector and a block leave a gap.
 """

@@ -236,15 +236,15 @@ def photo_size(view: CameraInfo) -> tuple[int, int]:
 
 
 def are_exchanged(photo: tuple[int, int], camera: tuple[int, int]) -> bool:
-    """Whether a photo's size (width, height) has a camera's sides exchanged, perhaps at another scale."""
+    """Tell whether a photo's size (width, height) is a camera's with width and height exchanged, at any scale."""
     (width, height), (w, h) = photo, camera
     return abs(width * w / h - height) <= 1 < abs(width * h / w - height)
 
 
-def exchanged_sides(
+def describe_exchanged_sides(
     names: Sequence[str], count: int, photo: tuple[int, int], camera: tuple[int, int]
 ) -> tuple[str, str]:
-    """What to say of photos whose sides are exchanged, the first of these sizes, of `count`; and the remedy."""
+    """Describe photos, the first of these sizes, of `count`, whose sides are exchanged; also return the remedy."""
     size, other = (f"{width} x {height}" for width, height in (photo, camera))
     return (
         f"{len(names)} of {count} photos have the sides of their camera exchanged, the first {names[0]} ({size}, "
@@ -279,7 +279,7 @@ def photo_names(cam_infos: Sequence[Any]) -> list[str]:
 
 
 def places(names: Any, among: Sequence[str]) -> list[int] | None:
-    """Places of names, as of an earlier training's photos, among others; None if they are not all there, each once."""
+    """Indices of names, as of an earlier training's photos, among others; None unless all are there, each once."""
     rows = {name: row for row, name in enumerate(among)}
     if not isinstance(names, list) or not all(isinstance(name, str) and name in rows for name in names):
         return None
@@ -294,7 +294,7 @@ def names_of_photos(info: SceneInfo) -> dict[str, str]:
 def normalization(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> dict[str, Any]:
     """`SceneInfo.nerf_normalization` of the training views: the radius is `scene_extent`."""
     centers = camera_centers(cameras)
-    return {"translate": -centers[~standing_apart(centers)].mean(axis=0), "radius": scene_extent(cameras, points)}
+    return {"translate": -centers[~outliers(centers)].mean(axis=0), "radius": scene_extent(cameras, points)}
 
 
 def camera_centers(cameras: Sequence[CameraInfo]) -> np.ndarray:
@@ -303,7 +303,7 @@ def camera_centers(cameras: Sequence[CameraInfo]) -> np.ndarray:
 
 
 def up_of(turns: np.ndarray) -> np.ndarray:
-    """What is up (3,): across the photos' sideward axes, which photographers hold level, as far as these differ.
+    """The up direction (3,), across the cameras' x axes as far as these differ: photographers hold them level.
 
     turns: (N,3,3), from camera to world axes.
     """
@@ -313,7 +313,7 @@ def up_of(turns: np.ndarray) -> np.ndarray:
 
 
 def from_above(up: np.ndarray) -> np.ndarray:
-    """Axes (2,3) of a picture from above: across `up` (3,), the second a quarter turn counter-clockwise."""
+    """Axes (2,3) of a picture from above: perpendicular to `up` (3,), the second a quarter turn counter-clockwise."""
     up = up / max(float(np.linalg.norm(up)), 1e-9)
     first = np.cross(up, np.eye(3)[np.abs(up).argmin()])
     first /= max(float(np.linalg.norm(first)), 1e-9)
@@ -323,12 +323,12 @@ def from_above(up: np.ndarray) -> np.ndarray:
 def scene_extent(cameras: Sequence[CameraInfo], points: np.ndarray | None = None) -> float:
     """Extent E: 1.1 times the largest distance of a camera from the cameras' mean, in world units.
 
-    Cameras that stand apart (`standing_apart`) are left out. If the cameras are nearly in one place (E below NARROW
+    Outlying cameras (`outliers`) are left out. If the cameras are nearly in one place (E below NARROW
     times the depth), E is 1.1 times the median depth of the points (N,3) in front of the first camera. Without such
     points it is then 1.
     """
     centers = camera_centers(cameras)
-    counted = ~standing_apart(centers)
+    counted = ~outliers(centers)
     centers, first = centers[counted], cameras[counted.argmax()]
     extent = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
     points = np.zeros((0, 3)) if points is None else points
@@ -340,8 +340,8 @@ def scene_extent(cameras: Sequence[CameraInfo], points: np.ndarray | None = None
     return extent if extent > NARROW * fallback else fallback
 
 
-def standing_apart(centers: np.ndarray) -> np.ndarray:
-    """Whether a camera centre of (N,3) is more than APART times the median distance from their median: (N,) bool."""
+def outliers(centers: np.ndarray) -> np.ndarray:
+    """Mark camera centres (N,3) farther than APART times the median distance from their median: (N,) bool."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     median = float(np.median(distances))
     # If most cameras are in one place, up to rounding, the others are no mistake.
@@ -364,7 +364,7 @@ def origin_near(middle: np.ndarray, extent: float) -> np.ndarray:
 
 
 def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
-    """The scene in the frame whose origin is `offset` (3,) of the world; its points become float32."""
+    """Move the scene into the frame whose origin is `offset` (3,) of the world; points become float32."""
     moved = bool(np.any(offset))
     train, test = info.train_cameras, info.test_cameras
     if moved:

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from groundwork.files.image_files import SUFFIXES
-from groundwork.files.plain_files import MOST, plain
-from groundwork.files.unread import say_unread
+from groundwork.files.plain_files import MOST, plain_path
+from groundwork.files.unread import note_unread
 from groundwork.host.listing import some
 from scene.images.find import FileIndex
 from scene.images.lens import PANORAMA
@@ -47,7 +47,7 @@ def cameras_xml(folder: Path) -> Path | None:
 
 def _is_metashape(path: Path) -> bool:
     try:
-        with open(plain(path), "rb") as file:
+        with open(plain_path(path), "rb") as file:
             head = file.read(_HEAD)
     except OSError:  # a folder, a pipe, or another user's: the file may be anybody's
         return False
@@ -90,13 +90,13 @@ def read_metashape(path: Path, images: str) -> dict[str, Any]:
         why = "are not aligned, have no place in their rig, or are not enabled"
         print(f"{len(without)} cameras of {path} {why}: {some(without)}", file=sys.stderr)
     told = [chunk, *cameras, *(part for tag in ("sensor", "component", "calibration") for part in chunk.iter(tag))]
-    say_unread(path, "metashape", {part.tag for of in told for part in of} - _READ)
+    note_unread(path, "metashape", {part.tag for of in told for part in of} - _READ)
     return {"frames": frames}
 
 
 def _chunk(path: Path) -> ElementTree.Element:
     try:
-        if os.path.getsize(plain(path)) > MOST:
+        if os.path.getsize(plain_path(path)) > MOST:
             raise ValueError(f"it has more than {MOST >> 20} MiB")
         root = ElementTree.parse(path).getroot()
     except (OSError, ValueError, ElementTree.ParseError) as error:

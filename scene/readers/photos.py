@@ -1,4 +1,4 @@
-"""Photos as training takes them: the views of photos of any lens, checked, upright and without distortion.
+"""Photos made ready for training: checked, upright, and of a lens that the rasterizer knows.
 
 Some programs make cameras of the upright photo and leave the file as the device wrote it. Such photos, and those whose
 lens the rasterizer does not know, are copied once into the user's cache folder. The key of an undistorted file covers
@@ -21,7 +21,7 @@ from PIL.PngImagePlugin import PngInfo
 from groundwork.files.color_tags import mark_srgb
 from groundwork.files.folders import cache_folder, remove_temporary_files
 from groundwork.files.image_files import UNREADABLE, open_image
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from groundwork.host.listing import some
 from groundwork.host.progress import in_threads
 from scene.images.decode import decode, picture_size, picture_sizes
@@ -36,7 +36,7 @@ from scene.images.lens import (
     visible_pixels,
 )
 from scene.images.masks import TRANSPARENT, Mask
-from scene.readers.info import CameraInfo, are_exchanged, exchanged_sides
+from scene.readers.info import CameraInfo, are_exchanged, describe_exchanged_sides
 from utils.system_utils import UserError, atomic_write, mkdir_p
 
 FARTHEST = 1e12  # from the origin, beyond which lie damaged files; there a double has steps of 1e-4
@@ -103,12 +103,12 @@ def camera_info(
     return camera
 
 
-def finished(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[CameraInfo]:
-    """The views with the sizes of their photos, all of them pinholes or native: other photos are undistorted.
+def to_pinholes(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[CameraInfo]:
+    """Make all views pinholes or native lenses, with sizes of photos: other photos are undistorted.
 
-    opaque: alpha of the photos is dropped, before undistortion mixes it with colours.
+    opaque: drop the photos' alpha, before undistortion mixes it with colours.
 
-    Photos that lie on their side against their camera are turned, if their EXIF orientation says so. A message says
+    Photos that lie on their side against their camera are turned if their EXIF orientation says so. A message says
     which photos have another shape than their camera. UserError for photos that cannot be read or stay on their side,
     and for a mask that cannot be used.
     """
@@ -140,7 +140,7 @@ def _check_shapes(cameras: Sequence[CameraInfo]) -> None:
     """UserError if photos would be stretched from upright to lying, or the other way round; a message if otherwise."""
     if lying := [camera for camera in cameras if _is_exchanged(camera)]:
         lens, names = lying[0].lens or lying[0], [camera.image_name for camera in lying]
-        said = exchanged_sides(names, len(cameras), lying[0].file_size, (lens.width, lens.height))
+        said = describe_exchanged_sides(names, len(cameras), lying[0].file_size, (lens.width, lens.height))
         raise UserError("; ".join(said))
     shapes = [(camera, camera.file_size, camera.lens or camera) for camera in cameras]
     others = [
@@ -157,8 +157,8 @@ def _check_shapes(cameras: Sequence[CameraInfo]) -> None:
         print(f"{count} {fault}; the first is {name} ({sizes}){remedy * square}", file=sys.stderr)
 
 
-def _made(folder: Path, kind: str) -> Path:
-    """A folder of the cache, which is there. UserError where it cannot be made."""
+def _cache_subfolder(folder: Path, kind: str) -> Path:
+    """Make a folder of the cache. UserError if that fails."""
     try:
         mkdir_p(folder)
     except UserError as error:
@@ -172,7 +172,7 @@ def _in_threads(work: Callable[[Job], Result], jobs: Iterable[Job], title: str) 
 
 
 def _is_exchanged(camera: CameraInfo) -> bool:
-    """Whether a view's photo, whose file_size is known, has the sides of its camera exchanged."""
+    """Tell whether a photo, whose file_size is known, has its camera's width and height exchanged."""
     lens = camera.lens or camera
     return are_exchanged(camera.file_size, (lens.width, lens.height))
 
@@ -186,7 +186,7 @@ def _upright(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
     turns = {n: turn for n, one in enumerate(cameras) if _is_exchanged(one) and (turn := _turn(one.image_path))}
     if not turns:
         return cameras
-    folder = _made(cache_folder() / "turned", "turned")
+    folder = _cache_subfolder(cache_folder() / "turned", "turned")
     remove_temporary_files(folder)
     photos = [Path(cameras[n].image_path) for n in turns]
     paths = _in_threads(lambda photo: _upright_path(photo, folder), photos, "Looking up photos")
@@ -217,7 +217,7 @@ def _turn(photo: Path) -> int | None:
 
 
 def _upright_path(photo: Path, folder: Path) -> Path:
-    digest = hashlib.blake2b(plain(photo).read_bytes(), digest_size=20, person=_UPRIGHT_FORMAT)
+    digest = hashlib.blake2b(plain_path(photo).read_bytes(), digest_size=20, person=_UPRIGHT_FORMAT)
     return folder / f"{digest.hexdigest()}.png"
 
 
@@ -257,12 +257,12 @@ def undistort(photos: Sequence[CameraInfo]) -> list[CameraInfo]:
     Bilinear, as in COLMAP. Alpha is undistorted, too, and weights the colours. UserError for a broken photo or a cache
     that cannot be written.
     """
-    folder = _made(undistorted_folder(), "undistorted")
+    folder = _cache_subfolder(undistorted_folder(), "undistorted")
     _say_which_are_cut(photos)
     version = import_pycolmap().__version__
     keys = _in_threads(lambda photo: _key(photo, version), photos, "Looking up undistorted photos")
     paths = [folder / key[:2] / f"{key}.png" for key in keys]
-    missing = {path: photo for path, photo in zip(paths, photos, strict=True) if not _kept(path)}
+    missing = {path: photo for path, photo in zip(paths, photos, strict=True) if not _is_cached(path)}
     if missing:
         remove_temporary_files(folder)
         _in_threads(lambda item: _make(item[1], item[0]), missing.items(), "Undistorting photos")
@@ -300,15 +300,15 @@ def _key(photo: CameraInfo, version: str) -> str:
     for path in (photo.image_path, photo.mask.path if photo.mask else None):
         if path is not None:
             try:
-                content = plain(path).read_bytes()
+                content = plain_path(path).read_bytes()
             except OSError as error:
                 raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
             digest.update(len(content).to_bytes(8, "little") + content)
     return digest.hexdigest()
 
 
-def _kept(path: Path) -> bool:
-    """Whether the undistorted photo is in the cache and complete, with its mask if it was made with one."""
+def _is_cached(path: Path) -> bool:
+    """Tell whether the undistorted photo is in the cache and complete, with its mask if it was made with one."""
     if not path.is_file():
         return False
     try:

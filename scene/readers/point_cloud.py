@@ -47,7 +47,7 @@ _GREY = 127 / 255
 
 
 def is_ply(path: Path) -> bool:
-    """Whether the file starts with the magic of a PLY."""
+    """Tell whether the file starts with the magic of a PLY."""
     return _begins_with(path, b"ply")
 
 

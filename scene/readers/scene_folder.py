@@ -34,7 +34,7 @@ def kind_of(source_path: str | os.PathLike) -> str:
             f"{folder} is an archive (a .r3d is a ZIP, too); unpack it, and give -s the folder that comes out"
         )
     if not folder.is_dir():
-        raise UserError(f"{folder} is a file; give -s the folder of the scene{_or_rather(scene_above(folder.parent))}")
+        raise UserError(f"{folder} is a file; give -s the folder of the scene{_scene_hint(scene_above(folder.parent))}")
     kind = _kind(folder)
     if kind is None:
         found = sorted(path.name for path in folder.iterdir())
@@ -47,12 +47,12 @@ def kind_of(source_path: str | os.PathLike) -> str:
 
 
 def is_scene(folder: str | os.PathLike) -> bool:
-    """Whether a folder has cameras of one of the kinds."""
+    """Tell whether a folder has cameras of one of the kinds."""
     return _kind(Path(folder)) is not None
 
 
-def is_apart(folder: Path) -> bool:
-    """Whether a folder is no scene and no model, has no scene in it, and lies in none."""
+def is_unrelated(folder: Path) -> bool:
+    """Tell whether a folder is no scene and no model, has no scene in it, and is in none."""
     return not (_scenes_in(folder) or scene_above(folder) or (folder / "cfg_args").is_file())
 
 
@@ -143,7 +143,7 @@ def scene_above(folder: Path) -> Path | None:
     return next((path for path in (folder, *folder.absolute().parents[:2]) if _kind(path)), None)
 
 
-def _or_rather(scene: Path | None) -> str:
+def _scene_hint(scene: Path | None) -> str:
     return f", {scene}" if scene else ""
 
 

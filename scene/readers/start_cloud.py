@@ -25,7 +25,7 @@ _PARALLEL = 1e-3
 
 
 class StartOptions(NamedTuple):
-    """The user's choice: points or a file of them (empty: none), else SFM (the scene's points) or RANDOM points."""
+    """The user's choice of points: given ones or a file (empty: none), else SFM (the scene's own) or RANDOM ones."""
 
     points: str | BasicPointCloud = ""
     kind: str = SFM

@@ -1,8 +1,8 @@
-"""Points that photos show, and where: those that structure from motion has seen, and any by their projection.
+"""Points in photos: the tracks of structure from motion, and projections of any points.
 
-The rasterizer draws nothing nearer than NEAREST. A scene whose points are nearer, since its unit is small, is trained,
-saved and shown in that unit. Only where it is drawn, cameras and Gaussians are larger by a power of two, which changes
-no digit of float32: then depths from NEAREST over the enlargement on are drawn.
+The rasterizer draws nothing nearer than NEAREST. A scene of a large unit has points that are nearer. It is trained,
+saved and shown in that unit, but rendered with cameras and Gaussians enlarged by a power of two, which changes no digit
+of float32: so depths from NEAREST / enlargement on are drawn.
 """
 
 import os
@@ -35,7 +35,7 @@ _SAMPLE = 5000  # points
 
 
 class Track(NamedTuple):
-    """What a photo has seen: points (K, 3) float64 of the training's frame, and their rays (K, 2), x / z and y / z.
+    """The track of a photo: its points (K, 3) float64 in the training's frame, and their rays (K, 2), x / z and y / z.
 
     angular: a ray is the angle from the axis (radians) times the direction in the image, as a fisheye shows it: it may
     be 90 degrees or more. places (K, 2): in the photo, in parts of its width and height. errors: of reprojection, in

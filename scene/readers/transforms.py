@@ -15,7 +15,7 @@ import numpy as np
 
 from groundwork.files.image_files import SUFFIXES
 from groundwork.files.json_files import read_json
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from groundwork.host.listing import some
 from scene.images.decode import picture_sizes
 from scene.images.find import FileIndex, find_images, find_in, find_listed, identity, other_folder
@@ -25,7 +25,7 @@ from scene.readers.holdout import EVERY, held_out, refuse_rule, split
 from scene.readers.info import CameraInfo, Posed, SceneInfo
 from scene.readers.metashape import read_metashape
 from scene.readers.phone_scans import read_polycam, read_record3d
-from scene.readers.photos import camera_info, finished
+from scene.readers.photos import camera_info, to_pinholes
 from scene.readers.point_cloud import read_point_cloud
 from scene.readers.scene_folder import camera_file
 from scene.readers.start_cloud import (
@@ -68,9 +68,9 @@ def read_blender(
     train = read_frames(files[0], masks, suffixes, images)
     test = _test_frames(files[1], masks, suffixes, images, hold_out)
     if hold_out:
-        train, test = _apart(_once(train, str(files[0])), held_out(_once(test, str(files[1]))), folder)
+        train, test = _without_tests(_unique(train, str(files[0])), held_out(_unique(test, str(files[1]))), folder)
     else:
-        train, test = _once(train + test, str(folder)), []
+        train, test = _unique(train + test, str(folder)), []
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
 
@@ -91,7 +91,7 @@ def read_poses(path: Path) -> list[Posed]:
     A message names the masks that the file gives, which nobody reads here.
     """
     content = _read(path)
-    say_unread(path, "transforms", {name for one in (content, *content["frames"]) for name in _MASKS if one.get(name)})
+    note_unread(path, "transforms", {name for one in (content, *content["frames"]) for name in _MASKS if one.get(name)})
     frames = enumerate(content["frames"], start=1)
     return [
         Posed(str(frame["file_path"]), *_pose(path, number, frame), partial(_lens, path, content, frame))
@@ -120,10 +120,10 @@ def _test_frames(
         return []
 
 
-def _apart(
+def _without_tests(
     train: list[CameraInfo], test: list[CameraInfo], listed_by: Path
 ) -> tuple[list[CameraInfo], list[CameraInfo]]:
-    """Training and test views, of which no photo is both: it is a test view."""
+    """Leave out training views whose photo is also a test view's."""
     tests = {_file(view) for view in test}
     left = [view for view in train if _file(view) not in tests]
     if train and not left:
@@ -136,8 +136,8 @@ def _apart(
     return left, test
 
 
-def _once(views: list[CameraInfo], listed_by: str) -> list[CameraInfo]:
-    """The views without those of a photo that has one already. UserError where the poses of the two differ."""
+def _unique(views: list[CameraInfo], listed_by: str) -> list[CameraInfo]:
+    """Leave out further views of the same photo. UserError if their poses differ."""
     found: dict[str, CameraInfo] = {}
     for view in views:
         first = found.setdefault(_file(view), view)
@@ -185,7 +185,7 @@ def read_nerfstudio(
         cameras = read(content)
         print(f"the test_frames of {path} are not used for training: {error}", file=sys.stderr)
     tests = {_file(view) for view in cameras[len(cameras) - len(content["test_frames"]) :]}
-    cameras = _once(cameras, str(path))
+    cameras = _unique(cameras, str(path))
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
@@ -205,7 +205,7 @@ def read_nerfstudio(
 
 
 def _content(path: Path, images: str) -> dict[str, Any]:
-    """What a camera file has, or what the export of another program would have in one."""
+    """Read the content of a camera file, or convert another program's export into it."""
     if path.is_dir():
         return read_polycam(path)
     if path.suffix.lower() == ".xml":
@@ -240,15 +240,15 @@ def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]
 
 def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
     frames = content["frames"]
-    told = {name for frame in frames for name, value in frame.items() if name not in _READ and _tells(value)}
+    told = {name for frame in frames for name, value in frame.items() if name not in _READ and _is_set(value)}
     if len({str(frame.get("time")) for frame in frames}) < 2:
         told.discard("time")  # the photos are of one moment
-    say_unread(path, "transforms", {name for name, value in content.items() if name not in _READ and _tells(value)})
-    say_unread(path, "frames", told)
+    note_unread(path, "transforms", {name for name, value in content.items() if name not in _READ and _is_set(value)})
+    note_unread(path, "frames", told)
 
 
-def _tells(value: Any) -> bool:
-    """Whether a value, or one in its lists, is neither zero, false nor empty."""
+def _is_set(value: Any) -> bool:
+    """Tell whether a value, or one in its lists, is not zero, false or empty."""
     return bool(np.any(np.array(value, dtype=object)))
 
 
@@ -291,7 +291,7 @@ def _cameras(
             mask = replace(mask or Mask(photo, drawn=False), circle=circle)
         name = photo.stem if by_stem else names[index]
         cameras.append(camera_info(index, name, photo, lens, R, T, mask, masks.ignore_alpha, native))
-    return finished(cameras, masks.drop_alpha)
+    return to_pinholes(cameras, masks.drop_alpha)
 
 
 def _lens(path: Path, content: dict[str, Any], frame: dict[str, Any], size: tuple[int, int]) -> Lens:

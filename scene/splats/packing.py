@@ -1,4 +1,4 @@
-"""Numbers in few bits: what the compressed formats share."""
+"""Packing of numbers into few bits, for all compressed formats."""
 
 import numpy as np
 import torch

@@ -24,7 +24,7 @@ from torch import Tensor
 
 from groundwork.files.json_files import LARGEST_OFFSET
 from groundwork.files.ply_header import header_lines, read_elements
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from scene.gaussians.ply import frame_comments, read_ply, read_vertices, write_ply
 from scene.readers.info import origin_near
 from scene.splats.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
@@ -58,7 +58,7 @@ def comments(splats: Splats) -> list[str]:
 
 
 def says_antialiasing(path: str | os.PathLike) -> bool:
-    """Whether the comments of a PLY say that its splats were trained with antialiasing; the last one counts."""
+    """Tell whether the comments of a PLY say that its splats were trained with antialiasing; the last one counts."""
     found = False
     for line in header_lines(path):
         words = line.lower().replace(":", " ").split()
@@ -247,7 +247,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
         rgb = _between(chunks, "color", chunk_of, rgba[:, :3]) if "min_r" in chunks.dtype.names else rgba[:, :3]
     except (PlyParseError, ValueError, KeyError, TypeError, OverflowError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a complete compressed PLY ({error}); save or download it again") from error
-    say_unread(path, "ply", set(vertex.dtype.names) - {*_PACKED})
+    note_unread(path, "ply", set(vertex.dtype.names) - {*_PACKED})
     three = (unpack(rotation, 10, 10, 10) - 0.5) * np.sqrt(2)
     rotations = whole_quaternions((rotation >> np.uint32(30)).astype(np.int64), three)
     sh = np.concatenate([((rgb - 0.5) / C0).astype(np.float32)[:, None], rest], axis=1)

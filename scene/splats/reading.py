@@ -20,7 +20,7 @@ _SPZ = (b"NGSP", b"\x1f\x8b")  # how its files begin
 
 
 def is_point_cloud(path: str | os.PathLike) -> bool:
-    """Whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
+    """Tell whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
     if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz", *CHECKPOINTS, *_OTHERS):
         return False
     names = _properties(path)

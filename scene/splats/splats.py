@@ -1,4 +1,4 @@
-"""A model's values as every format takes them, choices among them, and the same in worlds of other axes."""
+"""Splats, the form in which all formats are read and written; selections, and rotations to other axes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from groundwork.files.plain_files import check_packed_rows
-from groundwork.files.unread import say_unread
+from groundwork.files.unread import note_unread
 from scene.splats.packing import morton_order, smallest_three, spread, to_bytes, whole_quaternions
 from scene.splats.splats import Splats, from_axes, half_rotated, logits, opacities, selected
 from utils.system_utils import UserError, atomic_write
@@ -117,9 +117,9 @@ def _streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
 
 
 def _drawn_in(splats: Splats) -> Splats:
-    """The splats, of which the farthest are nearer and smaller, so that they look the same from the middle.
+    """Move the farthest splats nearer and shrink them, so that they look the same from the middle.
 
-    All positions have the same steps, which one splat far away would make coarse. It is told which splats change.
+    All positions have the same step, which one splat far away would make coarse. A message counts the changed splats.
     """
     middle, distances, usual = spread(splats.means)
     limit = _FARTHEST * usual
@@ -232,7 +232,7 @@ def _axes(records: bytes, header: _Header, path: str | os.PathLike) -> str:
         place += 8 + size
     if flags := header.flags & ~(_ANTIALIASED | _EXTENDED):
         others.append(f"flags 0x{flags:02X}")
-    say_unread(path, "spz", others)
+    note_unread(path, "spz", others)
     return axes
 
 

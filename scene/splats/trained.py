@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from groundwork.files.tensor_files import read_tensors
-from groundwork.files.unread import say_once
+from groundwork.files.unread import note_once
 from scene.splats.splats import Splats
 from utils.sh_utils import RGB2SH
 from utils.system_utils import UserError
@@ -32,11 +32,11 @@ def read_trained(path: str | os.PathLike) -> Splats:
         values = _named(content[part])
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise UserError(f"{path} is a checkpoint without Gaussians of gsplat or nerfstudio; {remedy}") from error
-    say_once(f"{path} is of {program}: it fits the cameras of a scene if its training did not normalize the world")
+    note_once(f"{path} is of {program}: it fits the cameras of a scene if its training did not normalize the world")
     if len(rank := sorted(Path(path).parent.glob(f"{Path(path).stem.rpartition('_rank')[0]}_rank*.pt"))) > 1:
-        say_once(f"warning: {path} has a part of the Gaussians; all are in {rank[0].name} to {rank[-1].name}")
+        note_once(f"warning: {path} has a part of the Gaussians; all are in {rank[0].name} to {rank[-1].name}")
     if values["shN"].shape[1] > _MOST_BANDS:
-        say_once(f"warning: SH bands of degree 4 of {path} are left out; models have at most degree 3")
+        note_once(f"warning: SH bands of degree 4 of {path} are left out; models have at most degree 3")
     if program == "nerfstudio" and not values["shN"].shape[1]:  # it has colours instead then
         values["sh0"] = RGB2SH(values["sh0"].sigmoid())
     sh = torch.cat([values["sh0"], values["shN"][:, :_MOST_BANDS]], dim=1)

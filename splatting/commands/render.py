@@ -33,9 +33,9 @@ from PIL import Image
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.camera_paths.render_path import add_path_options, path_request, render_path
-from gaussian_renderer.memory_errors import memory_errors_explained
+from gaussian_renderer.memory_errors import explain_memory_errors
 from gaussian_renderer.rays import check_views
-from gaussian_renderer.scored_views import ScoredViews, beside_test
+from gaussian_renderer.scored_views import ScoredViews, extra_test_views
 from groundwork.files.image_files import open_image, remove_leftovers, save_png, write_plane
 from groundwork.files.json_files import write_json
 from groundwork.host.progress import Bar
@@ -138,7 +138,7 @@ def render_set(
     folder = Path(model_path) / name / f"ours_{iteration}"
     for of_earlier in (TIMES, DEPTHS):  # of an interrupted run they do not count
         (folder / of_earlier).unlink(missing_ok=True)
-    with memory_errors_explained(gaussians, views):
+    with explain_memory_errors(gaussians, views):
         seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes, points, scored)
     if not seconds:
         print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
@@ -180,7 +180,7 @@ def render_sets(
         views = scene.getTestCameras()
         points = held_out_points(scene, dataset.source_path) if "depth" in planes else None
         render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
-        beside = beside_test(scene, pipeline, background)
+        beside = extra_test_views(scene, pipeline, background)
         for name in BESIDE:
             scored, shown = beside.get(name, (None, []))
             method = f"{scene.loaded_iter}_{name}"

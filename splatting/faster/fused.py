@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from gaussian_renderer import Drawn, KnownBands, draw, exposed, in_world_units
+from gaussian_renderer import CachedBands, Drawn, apply_trained_exposure, draw, to_world_units
 from scene.fused_adam import CAMERA_NUMBERS, FusedAdam
 from splatting.faster.faster import FasterSteps, Tell
 from splatting.iteration import Iteration, Losses
@@ -24,7 +24,7 @@ class FusedStep(FasterSteps):
         pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.camera_steps else None
         self.camera_gradient = pose  # of the last step
         self._adam = FusedAdam(run.gaussians, run.strategy.penalty)
-        self._bands = KnownBands()
+        self._bands = CachedBands()
         self._is_known = False  # whether the model is one that the operator steps
         self._has_parameter_terms = False
 
@@ -79,8 +79,8 @@ class FusedStep(FasterSteps):
             image, depth = drawn.image.requires_grad_(), drawn.depth
             if depth is not None:
                 depth.requires_grad_()
-            color = exposed(image, at.camera, run.gaussians) if applied else image
-            package = {"render": color, "depth": in_world_units(depth, run.gaussians), "band": drawn.band}
+            color = apply_trained_exposure(image, at.camera, run.gaussians) if applied else image
+            package = {"render": color, "depth": to_world_units(depth, run.gaussians), "band": drawn.band}
             losses = objective(package, at)
             losses.total.backward()
         # Observers keep losses for a while, which must not keep the image and its gradient.

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gaussian_renderer import exposed
+from gaussian_renderer import apply_trained_exposure
 from gaussian_renderer.blending import weighted_sums
 from groundwork.deterministic.portable_math import exp, log
 from groundwork.ranks.rows import changes_rows
@@ -29,7 +29,7 @@ def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     steps are long: with the parent's averages they would stay almost where they are.
     """
     count = len(parents)
-    if not gaussians.shards.ranks.anyone(count > 0):
+    if not gaussians.shards.ranks.any_rank(count > 0):
         return
     rows = gaussians.rows_at(parents)
     shapes = gaussians.log_scales(), gaussians.opacity_logits()
@@ -38,8 +38,8 @@ def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
     children |= gaussians.raw_shapes(children["opacity"], children["scaling"])
     second = rows | {name: values[count:] for name, values in children.items()}
     gaussians._take(gaussians.cat_tensors_to_optimizer(second))
-    gaussians.shards.appended(count)
-    gaussians.shards.order(gaussians.shards.items(parents))
+    gaussians.shards.note_appended(count)
+    gaussians.shards.order_appended(gaussians.shards.global_indices(parents))
     gaussians._zero_statistics()
     for name, values in children.items():
         gaussians.raw(name)[parents] = values[:count]
@@ -100,7 +100,7 @@ def error_scores(
 
     def errors(image: Tensor, camera: Camera) -> Tensor:
         target, mask = camera.ground_truth(background)
-        image = exposed(image, camera, gaussians) if exposures else image
+        image = apply_trained_exposure(image, camera, gaussians) if exposures else image
         return error_map(image, target, mask, camera.columns).expand(3, -1, -1).contiguous()
 
     total = torch.zeros(len(gaussians), dtype=torch.float64, device=background.device)

@@ -43,12 +43,12 @@ class Depths(Part):
     def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
         from pathlib import Path
 
-        from scene.dataset_readers import replaced_reader
+        from scene.dataset_readers import find_reader_replacement
         from scene.readers.depth_maps import with_depth_maps
         from scene.readers.depth_scale import check_maps
         from scene.readers.scene_folder import kind_of
 
-        if not fresh or replaced_reader(kind_of(args.source_path)):  # which finds the maps itself
+        if not fresh or find_reader_replacement(kind_of(args.source_path)):  # which finds the maps itself
             return info
         info = with_depth_maps(info, Path(args.source_path), args.depths)
         check_maps(info, Path(args.source_path, args.depths))

@@ -47,10 +47,10 @@ class Exposure(Appearance):
     # fmt: on
 
     def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
-        from scene.dataset_readers import replaced_reader
+        from scene.dataset_readers import find_reader_replacement
         from scene.readers.scene_folder import kind_of
 
-        by_other_code = replaced_reader(kind_of(args.source_path))  # which gets the option as an argument
+        by_other_code = find_reader_replacement(kind_of(args.source_path))  # which gets the option as an argument
         return info if by_other_code else train_on_all(info)
 
     def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:

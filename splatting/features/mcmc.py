@@ -121,7 +121,7 @@ class Mcmc(Strategy):
             return ()
         count = gaussians.gaussian_count
         moves = 0 < self._limit(iteration, count, 0) < count or self._grown(count, iteration) > count
-        moves = moves or gaussians.shards.ranks.anyone(not is_alive(gaussians, least).all())
+        moves = moves or gaussians.shards.ranks.any_rank(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
     def change_rows(self, at: "Iteration") -> None:

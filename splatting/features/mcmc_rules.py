@@ -50,7 +50,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, *, seed: int, it
     """
     live = is_alive(gaussians, min_opacity)
     dead = (~live).nonzero().reshape(-1)
-    counts = gaussians.shards.ranks.numbers(len(dead))[:, 0]
+    counts = gaussians.shards.ranks.all_gather_host_ints(len(dead))[:, 0]
     count = int(counts.sum())
     if 0 < count < gaussians.gaussian_count:
         draws, origins = _divide(gaussians, live, count, seed, iteration, _RELOCATION)
@@ -65,7 +65,7 @@ def grow(gaussians: GaussianParameters, count: int, *, seed: int, iteration: int
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.raw("xyz").device)
     draws, origins = _divide(gaussians, every, count, seed, iteration, _GROWTH)
     append_rows(gaussians, gaussians.rows_at(origins), origins)
-    gaussians.shards.order(draws)
+    gaussians.shards.order_appended(draws)
 
 
 @torch.no_grad()
@@ -121,7 +121,7 @@ def draw(
         tickets = (share * ends[-1]).to(torch.int64)
         return items, torch.searchsorted(ends, torch.minimum(tickets, ends[-1] - 1), right=True)
     own = int(units.sum())
-    below, total = shards.ranks.before(own)
+    below, total = shards.ranks.offset_and_total(own)
     tickets = (share * total).to(torch.int64).clamp_max(total - 1) - below
     mine = ((tickets >= 0) & (tickets < own)).nonzero().reshape(-1)
     return mine, torch.searchsorted(ends, tickets[mine], right=True)

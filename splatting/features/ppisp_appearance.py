@@ -33,7 +33,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from groundwork.deterministic.portable_math import exponential, root
+from groundwork.deterministic.portable_math import exponential, square_root
 from groundwork.files.json_files import read_json, write_json
 from groundwork.host.machine import compute_device
 from scene.gaussians.adam import GaussianAdam
@@ -131,7 +131,7 @@ class PhotoAppearance(Exposures):
         row = self._row_of.index_select(0, self.index(name))
         found = {"photos": self.photo(name), "response": self._response(row)}
         found |= {kind: _row(self._read(kind), row) for kind in ("vignetting", "middle")}
-        return sum(_ALL[kind][2] * root(numbers.square() + _SMALL**2).sum() for kind, numbers in found.items())
+        return sum(_ALL[kind][2] * square_root(numbers.square() + _SMALL**2).sum() for kind, numbers in found.items())
 
     @torch.no_grad()
     def fitted(self, image: Tensor, target: Tensor, counts: Tensor, colmap_id: object) -> Tensor:

@@ -50,7 +50,7 @@ class PoseRefinement:
         tracked = TrackedPoses(given, tracks, focals, unit)
         drift = _drift(tracked.starts[:count], unit)
         # Another kind of processor may round their solutions in another way.
-        self._tracked, self._drift = ranks().shared((tracked, drift))
+        self._tracked, self._drift = ranks().broadcast_object((tracked, drift))
         self._given, self._unit = given[:count], unit
         # Rows and translation are those of the enlarged frame, the centre is the world's.
         self._where_drawn = np.repeat((scene.gaussians.enlargement, 1.0), (12, 3))

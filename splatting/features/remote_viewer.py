@@ -57,7 +57,7 @@ class RemoteViewer(Part):
     def due(self, at: "Iteration") -> bool:
         if self._gui.conn is None:
             self._gui.try_connect()
-        self._asked = self._gui.is_asked() and not at.last
+        self._asked = self._gui.has_request() and not at.last
         return self._asked
 
     def measured(self, at: "Iteration", losses: "Losses") -> None:
@@ -69,7 +69,7 @@ class RemoteViewer(Part):
         if error is None:
             if self._gui.conn is None:
                 self._gui.try_connect()
-            if self._gui.holds(last=True):
+            if self._gui.wants_wait(last=True):
                 print("The model is saved; this process runs until the viewer disconnects, or until Ctrl-C")
             self._serve(last=True)
         self._gui.disconnect()
@@ -77,15 +77,15 @@ class RemoteViewer(Part):
     def _serve(self, last: bool) -> None:
         """Answer until the viewer lets training go on, leaves, or a signal asks to stop."""
         while self._has_request(last) and self._answer():
-            if not self._gui.holds(last):
+            if not self._gui.wants_wait(last):
                 return
 
     def _has_request(self, last: bool) -> bool:
         """Whether a request is there, after waiting for it if the viewer wants that."""
-        while self._gui.holds(last) and not self._run.interrupt.requested:
-            if self._gui.is_asked(_TICK):
+        while self._gui.wants_wait(last) and not self._run.interrupt.requested:
+            if self._gui.has_request(_TICK):
                 return True
-        return self._gui.is_asked(_LAST if last else 0.0) and not self._run.interrupt.requested
+        return self._gui.has_request(_LAST if last else 0.0) and not self._run.interrupt.requested
 
     def _answer(self) -> bool:
         """Answer one request; whether the viewer is still there."""

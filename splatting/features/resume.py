@@ -94,7 +94,7 @@ class Resume(Part):
     def due(self, at: "Iteration") -> bool:
         launch = self._run.launch
         asked = launch.resume and not at.last and at.iteration % EVERY == 0
-        self._is_due = asked and self._run.group.shared(self._has_time())
+        self._is_due = asked and self._run.group.broadcast_object(self._has_time())
         return self._is_due or self._leaves(at)
 
     def _has_time(self) -> bool:

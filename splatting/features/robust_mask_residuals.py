@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, interpolate, max_pool2d
 
 from gaussian_renderer.scored_views import ScoredViews
-from groundwork.files.image_files import dimmed, to_bytes
+from groundwork.files.image_files import dim_masked, to_bytes
 from groundwork.host.listing import some
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -196,7 +196,7 @@ def _draw(masks: Residuals, shares: dict[str, float], background: Tensor, path: 
     rows, cameras = [], {camera.image_name: camera for camera in masks.cameras}
     for name in list(shares)[:WORST]:
         photo = as_float(cameras[name].target(background))
-        both = photo, dimmed(photo, masks.counted(cameras[name]))
+        both = photo, dim_masked(photo, masks.counted(cameras[name]))
         images = [Image.fromarray(to_bytes(image).numpy()) for image in both]
         rows.append(list(zip((name, f"{shares[name]:.0%}"), images, strict=True)))
     with atomic_write(path) as temporary:

@@ -43,7 +43,7 @@ class Sky(Part):
             self.shell = shell.with_shell(run.scene, run.gaussians)
         self.active = self.shell is not None
         if self.active:
-            fill(run.gaussians, "pinned", self.shell.rows, self)
+            fill(run.gaussians, "fixed", self.shell.rows, self)
 
     def terms(self, at: "Iteration") -> "dict[str, Term]":
         points = self.shell.at(at.camera, self._run.scene)

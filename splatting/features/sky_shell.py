@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool2d, avg_pool2d, max_pool2d
 
-from groundwork.deterministic.portable_math import root
+from groundwork.deterministic.portable_math import square_root
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.density_rules import logit
@@ -101,7 +101,7 @@ class Shell:
         """Put the sky's Gaussians back on the sphere, and make those smaller that a split could send away from it."""
         means, scales = gaussians.raw("xyz"), gaussians.raw("scaling")
         far, center = self.rows(means)[:, None], means.new_tensor(self.center)
-        factor = self.radius / root(self._distances2(means))
+        factor = self.radius / square_root(self._distances2(means))
         means.copy_(torch.where(far, center + (means - center) * factor[:, None], means))
         largest = math.log(_WIDEST * self.radius)
         scales.copy_(torch.where(far, gaussians.raw_scaling(gaussians.log_scales().clamp_max(largest)), scales))

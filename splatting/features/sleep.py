@@ -43,7 +43,9 @@ class Sleep(Part):
         alone = not (strategy.queues or any(strategy.penalty))
         if not (dense and alone and run.is_standard):
             return False
-        return run.group.anyone(run.gaussians.room.limit > 0) or share_of(run.scene, run.device) < sleeping.MOST_SHARE
+        return (
+            run.group.any_rank(run.gaussians.storage.limit > 0) or share_of(run.scene, run.device) < sleeping.MOST_SHARE
+        )
 
     def after_step(self, at: "Iteration") -> None:
         if (sleeping := self._run.sleeping) is None:

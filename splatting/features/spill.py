@@ -48,18 +48,18 @@ class Spill(Part):
         release_torch()  # from the limit of a training that was refused after this
         self._model = run.gaussians
         absolute = any(part_class(name).takes_absolute(run.opt) for name in strategies())
-        fill(self._model, "room", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
+        fill(self._model, "storage", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
 
     def ready(self, run: Any) -> None:
-        self._model.room.expect(-(-run.strategy.max_gaussians // run.group.size), run.scene)
+        self._model.storage.reserve(-(-run.strategy.max_gaussians // run.group.size), run.scene)
 
     def opened(self, run: Any) -> None:
-        announce(run, self._model.room)
-        self._model.room.settle(self._model)
+        announce(run, self._model.storage)
+        self._model.storage.rebalance(self._model)
 
     def after_step(self, at: "Iteration") -> None:
         if at.changes:
-            self._model.room.settle(self._model)
+            self._model.storage.rebalance(self._model)
 
     def ended(self, error: Error) -> None:
         from splatting.features.spill_memory import release_torch

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from groundwork.host.memory import free_memory
 from scene.gaussian_model import GaussianModel
-from scene.gaussians.spilled import Room, bytes_of, empty_rows, is_spilled
+from scene.gaussians.spilled import Storage, bytes_of, empty_rows, is_spilled
 from scene.scene import Scene
 from splatting.resources import PER_PIXEL, largest_view, photo_bytes, training_bytes
 
@@ -31,12 +31,12 @@ def resident_rows(limit: float, count: int, others: float, spillable: float) -> 
     return max(min(int(count * (limit - others) / spillable), count), 0) if spillable else count
 
 
-class GpuMemory(Room):
+class GpuMemory(Storage):
     """Decides how many rows of f_rest and its averages stay on the GPU.
 
     While rows change, new tensors find the GPU's memory taken by the old ones. What lacks room lies on the host until
-    `settle` brings it back. limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is
-    spilled. It spills nothing before `expect` knows the scene.
+    `rebalance` brings it back. limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is
+    spilled. It spills nothing before `reserve` knows the scene.
     """
 
     def __init__(self, limit: float, gaussians: GaussianModel, absolute: bool, device: torch.device) -> None:
@@ -50,7 +50,7 @@ class GpuMemory(Room):
             self.limit = min(self.limit, int(_USABLE * there))
         self._limit_torch(0)
 
-    def expect(self, count: int, scene: Scene) -> None:
+    def reserve(self, count: int, scene: Scene) -> None:
         """Take note of a number of this process's Gaussians that will come: a limit begins where they do not fit."""
         self._fixed = PER_PIXEL * largest_view(scene) + photo_bytes(scene.images, self._device)
         if self.limit or self._device.type != "cuda" or not CAN_SPILL:
@@ -70,7 +70,7 @@ class GpuMemory(Room):
         self._limit_torch(max(3 * each, bytes_of()[0] + size))
         return empty_rows(like, rows, size)
 
-    def settle(self, gaussians: GaussianModel) -> None:
+    def rebalance(self, gaussians: GaussianModel) -> None:
         """Bring rows to the GPU for which there is room, now that rows have changed."""
         if not self.limit or not self._spills(len(gaussians)):
             return

@@ -57,7 +57,7 @@ class TimeBudget(Part):
         from splatting.features.time_budget_file import schedule_of
 
         self._run = run
-        schedule = schedule_of(run.opt, run.start, run.first_iteration, run.group.shared, state)
+        schedule = schedule_of(run.opt, run.start, run.first_iteration, run.group.broadcast_object, state)
         fill(run, "schedule", schedule, self)
         self._end_in_time(run.opt)
 
@@ -165,7 +165,7 @@ class Sizes:
         free = free_memory(torch.device(self._images.device))
         room = free is None or self._images.planned_bytes / factor / factor <= GPU_SHARE * free
         # Ranks that share pictures make the smaller ones together.
-        self._keeps = not self._images.ranks.anyone(self._images.limit > 0 or not room)
+        self._keeps = not self._images.ranks.any_rank(self._images.limit > 0 or not room)
 
 
 def smaller(camera: "View", factor: float) -> tuple[int, int]:

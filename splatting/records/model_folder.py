@@ -8,7 +8,7 @@ from typing import Any
 
 from arguments.stored import read_model_json, read_stored_options
 from groundwork.files.json_files import SCHEDULE, read_json
-from groundwork.files.plain_files import plain
+from groundwork.files.plain_files import plain_path
 from scene.gaussians.sh_bands import SH_INTERVAL
 from splatting.records.error_curve import NAME as CURVE
 from splatting.records.error_curve import Row, read_curve
@@ -30,7 +30,7 @@ def count_gaussians(model: Path, iteration: int) -> int:
     """Read the number of Gaussians of a saved iteration from the header of its PLY."""
     ply = saved_ply(model, iteration)
     try:
-        with open(plain(ply), "rb") as file:
+        with open(plain_path(ply), "rb") as file:
             header = file.read(4096).split(b"end_header")[0]
     except OSError as error:
         raise UserError(f"cannot read {ply} ({error.strerror}); train the model again") from error

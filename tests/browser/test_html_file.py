@@ -15,9 +15,9 @@ from room_scene import cameras as in_room
 from tab_pictures import BACKGROUND, SECONDS, expected, psnr, settled
 
 from applications.export.html import write_html
-from applications.export.walking import EYES, solid_of
+from applications.export.walking import EYES, make_solid
 from gaussian_renderer.camera_paths.poses import poses_of
-from gaussian_renderer.camera_paths.start import narrowed
+from gaussian_renderer.camera_paths.start import narrow_fov
 from gaussian_renderer.free_view import free_view
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, heigh
     show(tab, page)
     shown = settled(tab)
     camera = cameras()[0]
-    fov, (position, turn) = narrowed(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
+    fov, (position, turn) = narrow_fov(math.radians(FOV), SIZE[0] / SIZE[1], width / height), placed(camera)
     view = free_view(width, height, fov, position, turn, "cpu")
     assert psnr(shown, expected(splats, view)) > 31
     faded = tab.evaluate("[...document.querySelectorAll('.sse-sceneLayer > div')].map(e => e.style.background).join()")
@@ -134,7 +134,7 @@ def test_nobody_leaves_what_photos_show(tab, page):
 
 def test_guests_walk_on_the_floor_and_stop_at_walls(tab, tmp_path):
     path = tmp_path / "room.html"
-    write_html(path, room(), in_room(), upright=True, metric=True, solid=solid_of(room(), in_room(), pipeline()))
+    write_html(path, room(), in_room(), upright=True, metric=True, solid=make_solid(room(), in_room(), pipeline()))
     show(tab, path)
     for _ in range(50):
         if tab.evaluate("viewer.state.walkAllowed"):

@@ -15,8 +15,8 @@ from served_page import serving_folder
 from tab_pictures import settled
 
 from applications.export import html, streamed
-from applications.export.formats import Around
-from applications.export.levels import octree
+from applications.export.formats import SceneInputs
+from applications.export.levels import build_octree
 from applications.export.sog import PROGRAM
 
 if TYPE_CHECKING:
@@ -37,13 +37,13 @@ window.viewer = await createViewer({ container: document.body, settings, content
 @pytest.fixture
 def address(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """A server of a streamed SOG of several levels, with the viewer."""
-    monkeypatch.setattr(streamed, "octree", lambda some: octree(some, most=200))
+    monkeypatch.setattr(streamed, "build_octree", lambda some: build_octree(some, most=200))
     poses = html.poses_of(cameras())
-    turn = html.turn_upright(html.up_of(poses))
+    turn = html.turn_upright(html.find_up(poses))
     streamed.write_lod_meta(
-        tmp_path / "lod-meta.json", html.rotated(balls(0), turn), Around((), (0, 0, 0), pipeline(), None, None)
+        tmp_path / "lod-meta.json", html.rotated(balls(0), turn), SceneInputs((), (0, 0, 0), pipeline(), None, None)
     )
-    settings = html.settings(poses, [str(k) for k in range(len(poses))], turn, None, (0.2, 0.4, 0.3), 3.0)
+    settings = html.make_settings(poses, [str(k) for k in range(len(poses))], turn, None, (0.2, 0.4, 0.3), 3.0)
     (tmp_path / "settings.json").write_text(json.dumps(settings))
     (tmp_path / "viewer.js").write_bytes(gzip.decompress((html.FOLDER / html.VIEWER).read_bytes()))
     (tmp_path / "index.html").write_text(PAGE)

@@ -16,8 +16,8 @@ from served_page import serving_folder
 from tab_pictures import BACKGROUND, expected, psnr, settled
 
 from applications.export import tiles3d
-from applications.export.formats import Around, format_of
-from applications.export.levels import Tile, joined, octree
+from applications.export.formats import SceneInputs, find_format
+from applications.export.levels import Tile, build_octree, join_splats
 from gaussian_renderer.camera_paths.poses import poses_of
 from scene.splats.splats import Splats
 
@@ -69,7 +69,7 @@ def show(
     """
     asked = []
     tab.on("response", lambda answer: asked.append((answer.status, Path(answer.url))))
-    format_of(f"{kind}.json").write(folder / f"{kind}.json", some, Around((), BACKGROUND, pipeline()))
+    find_format(f"{kind}.json").write(folder / f"{kind}.json", some, SceneInputs((), BACKGROUND, pipeline()))
     view = {"width": SIZE[0], "height": SIZE[1], "fov": FOV, "camera": in_tiles(camera), "error": error}
     view |= {"background": BACKGROUND, "place": some.place}
     (folder / "view.json").write_text(json.dumps(view))
@@ -84,7 +84,7 @@ def show(
         tab.goto("about:blank")  # which asks the server for nothing more
     assert {status for status, _ in asked} == {200}
     loaded = {path.stem for _, path in asked if path.suffix == ".glb"}
-    return shown, [tile for tile in octree(some, MOST).all() if tile.name in names], loaded
+    return shown, [tile for tile in build_octree(some, MOST).all() if tile.name in names], loaded
 
 
 def level(shown: np.ndarray, some: Splats, camera) -> float:
@@ -96,7 +96,7 @@ def level(shown: np.ndarray, some: Splats, camera) -> float:
 
 @pytest.fixture(autouse=True)
 def small_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, MOST))
+    monkeypatch.setattr(tiles3d, "build_octree", lambda some: build_octree(some, MOST))
 
 
 @pytest.mark.parametrize(
@@ -113,7 +113,7 @@ def test_the_viewer_shows_the_levels_that_it_needs(tab, tmp_path, error, coarse)
     shown, tiles, loaded = show(tab, tmp_path, some, camera, error)
     names = {tile.name for tile in tiles}
     assert {name for name in names if len(name) < 3} == coarse and {"r", *names} <= loaded
-    together = joined([tile.splats for tile in tiles])
+    together = join_splats([tile.splats for tile in tiles])
     assert (len(together) == len(some)) == (error == 1)
     assert level(shown, together, camera) > LEAST
 

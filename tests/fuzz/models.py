@@ -9,7 +9,7 @@ from gaussians import model, options, take_steps
 from rasterizer_tools import render
 from small_splats import empty_spz, splats
 
-from applications.export.formats import format_of
+from applications.export.formats import find_format
 from fuzz.damage import changed, damaged, damaged_text
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint
@@ -53,7 +53,7 @@ class Splats:
         self._folder, self._whole = folder, []
         for ending in (".compressed.ply", ".splat", ".spz"):
             path = folder / f"whole{ending}"
-            format_of(path).write(path, splats(20, 1))
+            find_format(path).write(path, splats(20, 1))
             self._whole.append((ending, path.read_bytes()))
         self._whole += [(".spz", empty_spz(version, 12_000_000)) for version in (3, 4)]
         unpacked = gzip.decompress(empty_spz(3, 20, 1))

@@ -11,7 +11,7 @@ from rasterizer_tools import few, ops, scene_arguments
 from simple_knn.backend import OPERATORS as knn
 from torch import Tensor
 
-from tests.workloads.splat_scenes import on_device, settings
+from tests.workloads.splat_scenes import move_camera, settings
 
 Call = tuple[Any, list]  # operator, arguments
 
@@ -19,7 +19,7 @@ Call = tuple[Any, list]  # operator, arguments
 def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict[str, Call]:
     """One call of each operator, by name. Operators that know no float64 get float32."""
     raw, size = few(dtype=dtype)
-    raw, camera = {name: t.to(device) for name, t in raw.items()}, on_device(settings(**size), device)
+    raw, camera = {name: t.to(device) for name, t in raw.items()}, move_camera(settings(**size), device)
     rand, single = partial(torch.rand, device=device, dtype=dtype), partial(torch.rand, device=device)
     integers = partial(torch.tensor, device=device, dtype=torch.int32)
     height, width, background = camera.image_height, camera.image_width, camera.bg.to(dtype)

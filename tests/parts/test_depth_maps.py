@@ -390,7 +390,7 @@ def test_metric_maps_are_distances_with_gaps(tmp_path, kind):
         distances[2 * place, 11] = gap
         known[2 * place, 11] = False
     _save_metric(distances, tmp_path / "a.b", kind)
-    units = Metric.of(tmp_path)._replace(scale=2.0)
+    units = Metric.from_folder(tmp_path)._replace(scale=2.0)
     (place,) = tmp_path.glob("a.b.*")
     assert place.name in map_names(units)("a.b.jpg") and place.name in map_names(units)("a.b")
     found = units.map_of(place).decode((12, 9))[0].numpy()
@@ -417,7 +417,7 @@ def test_one_scale_is_fitted_to_all_metric_maps(colmap_scene, kind, capsys):
         _depths(colmap_scene)
     make_depth_scale.main(["--base_dir", str(colmap_scene), "--depths_dir", str(colmap_scene / "depths")])
     assert "17 of 17 photos have a metric map: 2.5 units of the scene for each metre" in capsys.readouterr().out
-    assert Metric.of(colmap_scene / "depths").scale == pytest.approx(2.5, rel=1e-3)
+    assert Metric.from_folder(colmap_scene / "depths").scale == pytest.approx(2.5, rel=1e-3)
     depths = _depths(colmap_scene)
     assert len(depths) == 17 and all(depth.metric for depth in depths.values())
     first = next(iter(depths.values()))

@@ -19,7 +19,7 @@ import metrics
 import render
 from applications.evaluation.plan import Run, SceneEntry
 from applications.evaluation.results import read_run
-from gaussian_renderer.scored_views import shown_as_trained
+from gaussian_renderer.scored_views import has_trained_exposure
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import Track
 from scene.saved_model import load_saved
@@ -242,7 +242,7 @@ def test_test_views_may_have_the_names_of_training_photos(tmp_path):
                   start=False)  # fmt: skip
     found.gaussians.exposures = appearance_of(found.info.train_cameras)
     assert list(found.gaussians.exposures.mapping) == [f"r_{k}" for k in range(4)]
-    seen = {name: [shown_as_trained(view, found.gaussians) for view in views]
+    seen = {name: [has_trained_exposure(view, found.gaussians) for view in views]
             for name, views in (("train", found.getTrainCameras()), ("test", found.getTestCameras()))}  # fmt: skip
     assert seen == {"train": [True] * 4, "test": [False] * 2}
 

@@ -21,7 +21,7 @@ from applications.demo.objects import demo_scene
 from applications.demo.tracer import FISHEYE, ring_views
 from applications.evaluation.plan import Run, SceneEntry
 from applications.evaluation.results import read_run
-from benchmarks.scenes.poses import disturbed
+from benchmarks.scenes.poses import disturb_poses
 from scene.dataset_readers import SceneInfo
 from scene.gaussian_model import GaussianModel
 from scene.poses import moved
@@ -208,7 +208,7 @@ def _poses(scene: Scene) -> np.ndarray:
 def test_all_views_begin_where_tracks_place_them(tmp_path):
     make_colmap_scene(tmp_path)
     wanted = _poses(Scene(_options(tmp_path, tmp_path / "out"), GaussianModel(1), start=False))
-    folder = disturbed(tmp_path, tmp_path / "disturbed", 1.5, 1, 2)
+    folder = disturb_poses(tmp_path, tmp_path / "disturbed", 1.5, 1, 2)
     given = Scene(_options(folder, tmp_path / "out"), GaussianModel(1), start=False)
     assert np.abs(_poses(given) - wanted).max() > 0.02
     assert _errors(given.getTrainCameras(), read_colmap(tmp_path, "images", True)) == pytest.approx([1.5, 1], rel=1e-4)
@@ -337,7 +337,7 @@ def test_a_model_has_the_poses_that_a_training_found(once, tmp_path):
 
 def test_test_views_are_scored_with_given_poses_too(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path / "right")
-    scene, out = disturbed(tmp_path / "right", tmp_path / "scene", 1.5, 1, 2), tmp_path / "out"
+    scene, out = disturb_poses(tmp_path / "right", tmp_path / "scene", 1.5, 1, 2), tmp_path / "out"
     words = "--eval", "--iterations", 200, "--test_iterations", 200, "--densify_from_iter", 1000, "--disable_viewer"
     train_on(scene, out, *words, "--refine_poses")
     log = json.loads((out / "train_log.json").read_text())

@@ -16,7 +16,7 @@ import train
 from applications.demo.make_scene import Things, write_scene
 from applications.demo.objects import Box, Thing, demo_scene
 from applications.demo.tracer import ring_views, shade, trace
-from benchmarks.scenes.made import with_sky
+from benchmarks.scenes.made import add_sky
 from groundwork.files.json_files import read_model_json
 from scene.gaussian_model import GaussianModel
 from scene.readers.tracks import projected
@@ -38,7 +38,7 @@ def _made(folder: Path, things: Things) -> Path:
 
 @pytest.fixture(scope="module")
 def scene(once) -> Path:
-    return once("sky_scene", lambda folder: _made(folder, with_sky))
+    return once("sky_scene", lambda folder: _made(folder, add_sky))
 
 
 def _found(folder: Path) -> tuple[Scene, Shell, np.ndarray, np.ndarray, float]:
@@ -52,7 +52,7 @@ def test_it_is_where_rays_meet_nothing_and_has_the_colours_there(scene):
     """As the tracer says."""
     loaded, sky, points, colors, share = _found(scene)
     np.testing.assert_allclose(np.linalg.norm(points - sky.center, axis=1), sky.radius, rtol=1e-9)
-    sky.points, things, shown, hit = points, with_sky(None), 0, 0
+    sky.points, things, shown, hit = points, add_sky(None), 0, 0
     for camera in loaded.getTrainCameras():
         view = loaded.info.train_cameras[camera.uid]
         toward = (points[projected(view, points)[2]] - view.center).T
@@ -62,7 +62,7 @@ def test_it_is_where_rays_meet_nothing_and_has_the_colours_there(scene):
         assert (sky.at(camera, loaded) is not None) == (toward.shape[1] > 0)
     assert shown > 1000 and hit < 0.01 * shown and share > FEWEST
     toward = ((points - sky.center) / sky.radius).T.astype(np.float32)
-    seen = shade(with_sky(0), np.float32(sky.center)[:, None], toward)
+    seen = shade(add_sky(0), np.float32(sky.center)[:, None], toward)
     assert np.abs(colors - seen.T).mean() < 0.02
 
 
@@ -149,7 +149,7 @@ def test_none_begins_in_a_resumed_training(scene, tmp_path, capsys):
 
 def test_what_cannot_be_is_refused_in_one_sentence(scene, tmp_path):
     with pytest.raises(UserError, match="--no_sky needs a model folder"):
-        export.sky_of(str(tmp_path), np.zeros((1, 3)))
+        export.find_sky(str(tmp_path), np.zeros((1, 3)))
     file = tmp_path / "schedule.json"
     write_schedule(file, Decided(100, [Block(9, 0.0, 1 / 9, 0.0)], 9, 9.0, strategy="mcmc"))
     words = ["-s", str(scene), "-m", str(tmp_path), "--iterations", "100", "--schedule", str(file)]

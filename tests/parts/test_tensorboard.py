@@ -74,8 +74,8 @@ def test_without_tensorboard_doctor_says_so_and_not_each_training(colmap_scene, 
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     _train(colmap_scene, tmp_path, "--iterations", "1")
     assert "TensorBoard" not in "".join(capsys.readouterr()) and not [*tmp_path.rglob("events.out*")]
-    version = environment._version
-    monkeypatch.setattr(environment, "_version", lambda name: None if name == "tensorboard" else version(name))
+    version = environment._read_version
+    monkeypatch.setattr(environment, "_read_version", lambda name: None if name == "tensorboard" else version(name))
     assert any(
         "no TensorBoard, so trainings write no event files" in line.text for line in environment.check_packages()
     )

@@ -64,7 +64,7 @@ class SplatScene:
         made = self.camera and self.camera._replace(**changes)
         made = made or settings(self.width, self.height, dtype, **changes)
         tensors = {k: v.to(dtype) for k, v in made._asdict().items() if isinstance(v, Tensor)}
-        return on_device(made._replace(**tensors), self.parameters["means"].device)
+        return move_camera(made._replace(**tensors), self.parameters["means"].device)
 
     def pinhole(self) -> tuple[Tensor, Tensor, int, int]:
         """Its camera as gsplat takes one: view (4, 4), K (3, 3), width and height."""
@@ -116,7 +116,7 @@ def settings(
     return made._replace(**changes)
 
 
-def on_device(camera: GaussianRasterizationSettings, device: torch.device | str) -> GaussianRasterizationSettings:
+def move_camera(camera: GaussianRasterizationSettings, device: torch.device | str) -> GaussianRasterizationSettings:
     """Return the same settings with their tensors on `device`."""
     return camera._replace(**{k: v.to(device) for k, v in camera._asdict().items() if isinstance(v, Tensor)})
 
@@ -159,13 +159,13 @@ def frustum(
     return SplatScene({"means": torch.stack([x, y, z], -1)} | draw.appearance(size), width, height)
 
 
-def in_morton_order(scene: SplatScene) -> SplatScene:
+def sort_by_morton(scene: SplatScene) -> SplatScene:
     """Sort the rows as trainings do."""
     order = morton_codes(scene.parameters["means"], 1.0).argsort(stable=True)
     return replace(scene, parameters={name: rows[order] for name, rows in scene.parameters.items()})
 
 
-ORDERS = {"random": lambda scene: scene, "morton": in_morton_order}
+ORDERS = {"random": lambda scene: scene, "morton": sort_by_morton}
 
 
 def ordinary(n: int = 2000, width: int = 203, height: int = 117) -> SplatScene:

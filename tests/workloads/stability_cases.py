@@ -15,7 +15,7 @@ from diff_gaussian_rasterization import GaussianRasterizationSettings, Gaussians
 from torch import Generator, Tensor
 
 from tests.workloads.splat_scenes import PARAMETERS, frustum, settings
-from tests.workloads.textbook import covariance_of
+from tests.workloads.textbook import make_covariances
 
 WIDTH, HEIGHT = 75, 53  # no multiple of the tile
 ORDINARY = 40  # Gaussians
@@ -71,7 +71,7 @@ def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
     return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
 
 
-def placed(pixel: Tensor, depth: Tensor, cam: GaussianRasterizationSettings) -> Tensor:
+def place_means(pixel: Tensor, depth: Tensor, cam: GaussianRasterizationSettings) -> Tensor:
     """Return means (n, 3) in the view's frame that project to pixels (n, 2) at depths (n,)."""
     size = torch.tensor([cam.image_width, cam.image_height], dtype=torch.float64)
     ndc = (2 * pixel + 1) / size - 1
@@ -98,7 +98,7 @@ def splats(
     cam = cam or camera()
     if means is None:
         size = torch.tensor([cam.image_width, cam.image_height])
-        means = placed(uniform(g, 0, 1, n, 2) * size, uniform(g, 2, 6, n), cam)
+        means = place_means(uniform(g, 0, 1, n, 2) * size, uniform(g, 2, 6, n), cam)
     if scales is None:
         if not isinstance(sigma, Tensor):
             sigma = sigma * normal(g, n, 3).mul(0.4).exp()
@@ -197,14 +197,14 @@ def long_needles(
         pixel = uniform(g, 0.1, 0.9, n, 2) * torch.tensor([cam.image_width, cam.image_height])
         pixel = pixel - (uniform(g, -2.5, 2.5, n) * length)[:, None] * across
         direction = torch.nn.functional.normalize(torch.cat([across, 0.01 * normal(g, n, 1)], 1))
-        means = placed(pixel, uniform(g, 2, 6, n), cam)
+        means = place_means(pixel, uniform(g, 2, 6, n), cam)
         sigma = torch.cat([length[:, None], thin], 1)
         return splats(g, n, sigma=sigma, means=means, rotations=turn_x_to(direction), cam=cam)
 
     return make, cam
 
 
-def needles_of(low: float, high: float) -> Callable[[Generator], Problem]:
+def make_needles(low: float, high: float) -> Callable[[Generator], Problem]:
     make, cam = long_needles(30, low, high)
     return lambda g: all_stiff(make(g), cam)
 
@@ -214,7 +214,7 @@ def needles_as_covariances(g: Generator) -> Problem:
     raw = make(g)
     rotations = torch.nn.functional.normalize(raw["rotations"].double())
     gaussians = Gaussians(raw["means"], raw["opacities"], raw["scales"].double().exp(), rotations)
-    full = covariance_of(gaussians, 1.0)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    full = make_covariances(gaussians, 1.0)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     given = {"means": raw["means"], "opacities": raw["opacities"].sigmoid(), "cov3d": full.float()}
     return all_stiff(given | {"colors": uniform(g, 0, 1, 30, 3).float()}, cam, raw=False)
 
@@ -224,7 +224,7 @@ def edge_on(cam: GaussianRasterizationSettings) -> Callable[[Generator], Problem
 
     def make(g: Generator) -> Problem:
         n = 30
-        means = placed(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), uniform(g, 2, 6, n), camera())
+        means = place_means(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), uniform(g, 2, 6, n), camera())
         thin = torch.nn.functional.normalize(torch.linalg.cross(means, normal(g, n, 3)))
         return among_ordinary(
             splats(g, n, sigma=axes(n, 1e-3, 20, 20), means=means, rotations=turn_x_to(thin), cam=cam), cam
@@ -233,7 +233,7 @@ def edge_on(cam: GaussianRasterizationSettings) -> Callable[[Generator], Problem
     return make
 
 
-def sized(sigma: float = 1.0, world: float | None = None, faint: float = 0.0) -> Callable[[Generator], Problem]:
+def make_sized(sigma: float = 1.0, world: float | None = None, faint: float = 0.0) -> Callable[[Generator], Problem]:
     def make(g: Generator) -> Problem:
         scales = None if world is None else world * normal(g, 30, 3).mul(0.4).exp()
         return among_ordinary(splats(g, 30, sigma=sigma, scales=scales, logits=normal(g, 30) - faint))
@@ -260,7 +260,7 @@ def stretched(
         n = 200
         longest, by = between(g, *length, n), between(g, *ratio, n)
         sigma = torch.stack([longest, longest / by ** uniform(g, 0, 1, n), longest / by], 1)
-        means = placed(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), between(g, *depth, n), camera())
+        means = place_means(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), between(g, *depth, n), camera())
         return among_ordinary(splats(g, n, sigma=sigma, means=means, logits=uniform(g, *logit, n)))
 
     return make
@@ -272,14 +272,14 @@ SHAPE = [
     Case("shape", "needles 1 : 1e+07, antialiased", needles(1e7, ANTIALIASED), STEEP),
     Case("shape", "pancakes 1 : 1e+04, antialiased", pancakes(1e4, ANTIALIASED), PLAIN),
     Case("shape", "pancakes edge-on, antialiased", edge_on(ANTIALIASED), STEEP),
-    Case("shape", "scales of 1e-10", sized(world=1e-10), STEEP),
-    Case("shape", "scales of 1e6", sized(world=1e6, faint=2), PLAIN),
+    Case("shape", "scales of 1e-10", make_sized(world=1e-10), STEEP),
+    Case("shape", "scales of 1e6", make_sized(world=1e6, faint=2), PLAIN),
     Case("shape", "three equal scales", round_ones, PLAIN),
-    Case("shape", "a thousandth of a pixel", sized(sigma=1e-3), STEEP),
-    Case("shape", "a thousand images wide", sized(sigma=1e3 * WIDTH, faint=2), PLAIN),
-    Case("shape", "needles of 300 to 2,000 px", needles_of(300, 2000), LONG, double=1e-11, cut=2e-3),
-    Case("shape", "conics of condition 1e7", needles_of(1700, 1760), LONG, double=1e-11, cut=2e-3),
-    Case("shape", "needles of 1e4 to 1e6 px", needles_of(1e4, 1e6), LONGEST, double=1e-10, cut=0.1),
+    Case("shape", "a thousandth of a pixel", make_sized(sigma=1e-3), STEEP),
+    Case("shape", "a thousand images wide", make_sized(sigma=1e3 * WIDTH, faint=2), PLAIN),
+    Case("shape", "needles of 300 to 2,000 px", make_needles(300, 2000), LONG, double=1e-11, cut=2e-3),
+    Case("shape", "conics of condition 1e7", make_needles(1700, 1760), LONG, double=1e-11, cut=2e-3),
+    Case("shape", "needles of 1e4 to 1e6 px", make_needles(1e4, 1e6), LONGEST, double=1e-10, cut=0.1),
     Case("shape", "needles of 100 to 1,000 px as covariances", needles_as_covariances, GIVEN, double=2e-2, cut=2e-3),
     # What trained models have besides (benchmarks.accuracy.census).
     Case("shape", "stretched, 0.05 to 10 px", stretched((0.05, 10), (10, 1e6)), PLAIN),
@@ -292,17 +292,17 @@ SHAPE = [
 # ---- place ----
 
 
-def at_depths(*depths: float) -> Callable[[Generator], Problem]:
+def make_depths(*depths: float) -> Callable[[Generator], Problem]:
     def make(g: Generator) -> Problem:
         z = torch.tensor(depths).double().repeat_interleave(4)
         n = len(z)
-        means = placed(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), z, camera())
+        means = place_means(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), z, camera())
         return among_ordinary(splats(g, n, means=means))
 
     return make
 
 
-def at_rays(low: float, high: float, depth: tuple[float, float], size: float) -> Callable[[Generator], Problem]:
+def make_rays(low: float, high: float, depth: tuple[float, float], size: float) -> Callable[[Generator], Problem]:
     """Place means low to high half images from the axis; scales are `size` times the distance from the axis."""
 
     def make(g: Generator) -> Problem:
@@ -360,19 +360,19 @@ def nextafter(value: float, steps: int) -> float:
 
 NEAR = [nextafter(0.2, steps) for steps in (-1, 1, 2)]
 PLACE = [
-    Case("place", "at the near plane", at_depths(0.19999, *NEAR, 0.20001, 0.201, 0.25), PLAIN),
+    Case("place", "at the near plane", make_depths(0.19999, *NEAR, 0.20001, 0.201, 0.25), PLAIN),
     Case("place", "behind, on and around the camera", in_the_dark, ABSENT),
-    Case("place", "1e7 units away", at_depths(1e5, 1e6, 1e7), PLAIN),
+    Case("place", "1e7 units away", make_depths(1e5, 1e6, 1e7), PLAIN),
     Case("place", "1e6 units from the origin", far_from_the_origin, ELSEWHERE, double=1e-8),
     Case("place", "at the limit of the Jacobian's ray", at_the_clamp, PLAIN),
-    Case("place", "3 to 1,000 half images aside", at_rays(3, 1e3, (1, 4), 0.5), PLAIN),
-    Case("place", "beside and above the camera", at_rays(20, 200, (0.2001, 0.22), 0.5), PLAIN),
+    Case("place", "3 to 1,000 half images aside", make_rays(3, 1e3, (1, 4), 0.5), PLAIN),
+    Case("place", "beside and above the camera", make_rays(20, 200, (0.2001, 0.22), 0.5), PLAIN),
 ]
 
 # ---- opacity and blending ----
 
 
-def with_logits(logits: Tensor) -> Callable[[Generator], Problem]:
+def make_logits(logits: Tensor) -> Callable[[Generator], Problem]:
     return lambda g: among_ordinary(splats(g, len(logits), sigma=4.0, logits=logits.double()))
 
 
@@ -383,7 +383,7 @@ def at_alpha(alpha: float) -> Callable[[Generator], Problem]:
         problem = among_ordinary(splats(g, 17, sigma=4.0))
         p = dict(problem.parameters)
         pixel = torch.stack([4 + 4 * torch.arange(17), 3 + 3 * torch.arange(17) % 50], 1).double()
-        p["means"][ORDINARY:] = placed(pixel, uniform(g, 2, 6, 17), problem.camera).float()
+        p["means"][ORDINARY:] = place_means(pixel, uniform(g, 2, 6, 17), problem.camera).float()
         p["opacities"] = p["opacities"].sigmoid()
         p["opacities"][ORDINARY:, 0] = torch.tensor([nextafter(alpha, k) for k in range(-8, 9)])
         p["scales"] = p["scales"].exp()
@@ -399,7 +399,7 @@ def one_pixel_stack(g: Generator) -> Problem:
     cam = camera(1, 1)
     alpha = uniform(g, 1.005, 1.05, n) / 255
     depth = torch.linspace(2, 6, n, dtype=torch.float64)[torch.randperm(n, generator=g)]
-    means = placed(uniform(g, -0.1, 0.1, n, 2), depth, cam)
+    means = place_means(uniform(g, -0.1, 0.1, n, 2), depth, cam)
     return all_stiff(splats(g, n, sigma=30.0, means=means, logits=torch.log(alpha / (1 - alpha)), cam=cam), cam)
 
 
@@ -411,7 +411,7 @@ def many_opaque(g: Generator) -> Problem:
 
 def tied(g: Generator, equal: bool) -> Problem:
     """Make thirty Gaussians at one depth; if `equal`, ten different ones three times."""
-    means = placed(uniform(g, 0, 1, 10, 2) * torch.tensor([WIDTH, HEIGHT]), torch.full((10,), 3.0), camera())
+    means = place_means(uniform(g, 0, 1, 10, 2) * torch.tensor([WIDTH, HEIGHT]), torch.full((10,), 3.0), camera())
     if not equal:
         return among_ordinary(splats(g, 30, sigma=8.0, means=torch.cat([means, means + 0.0, means]).roll(1, 0)))
     made = splats(g, 10, sigma=8.0, means=means)
@@ -419,8 +419,8 @@ def tied(g: Generator, equal: bool) -> Problem:
 
 
 OPACITY = [
-    Case("opacity", "logits from -50 to 50", with_logits(torch.linspace(-50, 50, 41)), PLAIN),
-    Case("opacity", "infinite logits", with_logits(torch.tensor([math.inf, -math.inf, math.inf, -math.inf])), PLAIN),
+    Case("opacity", "logits from -50 to 50", make_logits(torch.linspace(-50, 50, 41)), PLAIN),
+    Case("opacity", "infinite logits", make_logits(torch.tensor([math.inf, -math.inf, math.inf, -math.inf])), PLAIN),
     Case("opacity", "alpha 0.99 within ulps", at_alpha(0.99), PLAIN),
     Case("opacity", "alpha 1/255 within ulps", at_alpha(1 / 255), PLAIN),
     Case("opacity", "50,000 splats on one pixel", one_pixel_stack, STACKED),
@@ -512,7 +512,7 @@ COUNTS = [
 # ---- NaN and Inf ----
 
 
-def poisoned(name: str, value: float) -> Callable[[Generator], Problem]:
+def make_poisoned(name: str, value: float) -> Callable[[Generator], Problem]:
     def make(g: Generator) -> Problem:
         made = splats(g, 6, sigma=6.0)
         made[name].view(6, -1)[:, 0] = value
@@ -523,7 +523,7 @@ def poisoned(name: str, value: float) -> Callable[[Generator], Problem]:
 
 
 NOT_FINITE = [
-    Case("not finite", f"{value} in {name}", poisoned(name, value), ABSENT)
+    Case("not finite", f"{value} in {name}", make_poisoned(name, value), ABSENT)
     for name in PARAMETERS
     for value in (math.nan, math.inf)
     if (name, value) != ("opacities", math.inf)

@@ -14,7 +14,7 @@ from torch import Generator, Tensor
 
 from scene.readers.info import origin_near
 from tests.workloads.splat_scenes import frustum, settings
-from tests.workloads.stability_cases import Parameters, normal, placed, uniform
+from tests.workloads.stability_cases import Parameters, normal, place_means, uniform
 
 WIDTH, HEIGHT, COUNT = 64, 48, 200
 VIEWS, HELD_OUT, EXTENT = 8, 4, 2.0  # extent: about 1.1 times the cameras' largest distance from their mean
@@ -35,7 +35,7 @@ def near(start: Parameters, g: Generator, depth: float = 0.2) -> None:
     """Place every third Gaussian about at a depth in a camera, by default just behind or before the near plane."""
     for k, camera in zip(range(0, COUNT, 3), VIEWS * cameras(VIEWS, torch.zeros(3)), strict=False):
         pixel = uniform(g, 0, 1, 1, 2) * torch.tensor([WIDTH, HEIGHT])
-        point = torch.cat([placed(pixel, depth * (1 + 0.1 * normal(g, 1)), camera)[0], torch.ones(1)])
+        point = torch.cat([place_means(pixel, depth * (1 + 0.1 * normal(g, 1)), camera)[0], torch.ones(1)])
         start["means"][k] = (point @ torch.linalg.inv(camera.viewmatrix))[:3]
         start["scales"][k] = math.log(3 * depth * 2 * camera.tanfovx / WIDTH)
 

@@ -59,7 +59,7 @@ def render(
 
 def _project(gaussians: Gaussians, means2d: Tensor, settings: GaussianRasterizationSettings) -> _Splats:
     means, s = gaussians.means, settings
-    covariance = covariance_of(gaussians, s.scale_modifier)
+    covariance = make_covariances(gaussians, s.scale_modifier)
     ones = torch.ones_like(means[:, :1])
     t = (torch.cat([means, ones], 1) @ s.viewmatrix)[:, :3]
     clip = torch.cat([means, ones], 1) @ s.projmatrix
@@ -120,7 +120,7 @@ def _blend(splats: _Splats, settings: GaussianRasterizationSettings) -> Rendered
     return Rendered(color, (weight / splats.depth[:, None, None]).sum(0, keepdim=True), last[None])
 
 
-def covariance_of(gaussians: Gaussians, scale_modifier: float) -> Tensor:
+def make_covariances(gaussians: Gaussians, scale_modifier: float) -> Tensor:
     """R S S^T R^T, or the given covariances unpacked: (N, 3, 3)."""
     if gaussians.cov3d is not None:
         return gaussians.cov3d[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)

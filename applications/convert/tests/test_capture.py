@@ -10,11 +10,18 @@ from scipy.ndimage import gaussian_filter
 
 import train
 from applications.convert import report
-from applications.convert.capture import compared, looks_of
 from applications.convert.capture_page import write_page
-from applications.convert.findings import lines_of, neighbours_of, of_model, unusable, worth
+from applications.convert.checks import (
+    check_reconstruction,
+    describe_capture,
+    find_gaps,
+    find_neighbours,
+    rate_capture,
+    why_unusable,
+)
 from applications.convert.layout import Layout
-from scene.checks.conversion import left_out
+from applications.convert.photo_quality import compare_brightness, measure_looks
+from scene.checks.conversion import describe_left_out
 from scene.checks.photos import SHARED_TEXT
 from utils.system_utils import UserError
 
@@ -48,21 +55,39 @@ def folder(tmp_path):
 
 
 def test_what_is_weak_blurred_and_darker_is_named(folder):
-    looks = looks_of(folder, NAMES)
+    looks = measure_looks(folder, NAMES)
     assert looks["a.jpg"].brightness - looks["d.jpg"].brightness == pytest.approx(2.0, abs=0.1)
-    assert neighbours_of(_survey()["photos"])["d.jpg"] == []
+    assert find_neighbours(_survey()["photos"])["d.jpg"] == []
     captioned = _report(4, 5, "e.jpg") | {"advice": [f"9% of each photo, at the top, {SHARED_TEXT}; mask it"]}
-    assert not any("e.jpg" in line for line in worth(captioned, _survey()["photos"], looks)["again"])
-    found = worth(_report(4, 5, "e.jpg"), _survey()["photos"], looks)
+    assert not any("e.jpg" in line for line in rate_capture(captioned, _survey()["photos"], looks)["again"])
+    found = rate_capture(_report(4, 5, "e.jpg"), _survey()["photos"], looks)
     assert (found["weakly_connected"], found["blurred"]) == (["d.jpg"], ["b.jpg"])
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0, 0, 0, 2]), abs=0.05)
     assert [line.split(":")[0] for line in found["again"]] == [
-        "what e.jpg show, if it belongs to the scene", "around d.jpg", "b.jpg", "with a fixed exposure, if you can",
+        "Take photos on the way from e.jpg to the others, each overlapping the one before by 60 to 80 %",
+        "Take more photos around d.jpg", "Hold the camera still, or add light, for b.jpg",
+        "Use a fixed exposure, if you can",
     ]  # fmt: skip
     assert found["again"][-1].endswith("--appearance ppisp")
-    assert lines_of(_report(4, 5, "e.jpg") | found)[:2] == [
+    assert describe_capture(_report(4, 5, "e.jpg") | found)[:2] == [
         "overlap: 1 of 4 photos weakly connected (d.jpg)", "blur: 1 of 5 photos blurred (b.jpg)",
     ]  # fmt: skip
+
+
+def test_where_photos_are_missing_is_said():
+    """The placed photos around a hole name it; single photos, and those at an end of a folder, are none."""
+    placed = ["0.jpg", "3.jpg", "5.jpg", "9.jpg", "a/1.jpg", "a/5.jpg"]
+    left = ["1.jpg", "2.jpg", "4.jpg", "6.jpg", "7.jpg", "8.jpg", "a/0.jpg", "a/6.jpg", "b/1.jpg", "b/2.jpg"]
+    assert find_gaps(left, placed) == [(3, "5.jpg", "9.jpg"), (2, "0.jpg", "3.jpg")]
+    photos = {name: {"shared": {other: 99 for other in placed if other != name}} for name in placed}
+    report = _report(6, 16, *left) | {"tried": [{"against": ["1.jpg", "4.jpg"]}]}
+    said = rate_capture(report, photos, {})["again"]
+    assert said[:2] == [
+        "Take photos between 5.jpg and 9.jpg: 3 there could not be placed",
+        "Take photos between 0.jpg and 3.jpg: 2 there could not be placed",
+    ]
+    assert len(said) == 3 and said[2].startswith("Take photos on the way from a/0.jpg, a/6.jpg, b/1.jpg, b/2.jpg to")
+    assert not find_gaps(["1.jpg"], ["0.jpg", "2.jpg"]) and not find_gaps([], placed) and not find_gaps(left, [])
 
 
 def test_what_photos_show_does_not_count(tmp_path):
@@ -88,21 +113,21 @@ def test_what_photos_show_does_not_count(tmp_path):
     (layout.sparse / "0" / "images.txt").write_text("\n".join(lines) + "\n")
     (layout.sparse / "0" / "points3D.txt").write_text("")
     photos = {name: {"shared": {other: 99 for other in names if other != name}} for name in names}
-    alone = worth(_report(8, 8), photos, looks_of(layout.images, names))
-    found = worth(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
+    alone = rate_capture(_report(8, 8), photos, measure_looks(layout.images, names))
+    found = rate_capture(_report(8, 8), photos, compare_brightness(measure_looks(layout.images, names), layout))
     assert alone["brightness_spread_stops"] > 1
     assert alone["blurred"] == found["blurred"] == ["b.jpg"]
     assert found["brightness_spread_stops"] == pytest.approx(np.std([0] * 7 + [2]), abs=0.15)
     (layout.sparse / "0" / "images.txt").write_text("\n\n".join(lines[::2]) + "\n\n")
-    found = worth(_report(8, 8), photos, compared(looks_of(layout.images, names), layout))
+    found = rate_capture(_report(8, 8), photos, compare_brightness(measure_looks(layout.images, names), layout))
     assert found["brightness_spread_stops"] is None and found["blurred"] == ["b.jpg"]
-    assert len(lines_of(_report(8, 8) | found)) == 3
+    assert len(describe_capture(_report(8, 8) | found)) == 3
 
 
 def _page(folder, names, survey, **report) -> str:
-    looks = looks_of(folder, NAMES)
+    looks = measure_looks(folder, NAMES)
     report = _report(len(survey["photos"]), len(names), *sorted(set(names) - set(survey["photos"]))) | report
-    report |= worth(report, survey["photos"], looks)
+    report |= rate_capture(report, survey["photos"], looks)
     write_page(folder / "capture.html", report, survey, looks, names, folder)
     return (folder / "capture.html").read_text(encoding="utf-8")
 
@@ -121,24 +146,24 @@ def test_the_page_shows_what_is_wrong_with_each_photo(folder):
     assert re.findall('<a href="#photo(.)"( class="weak")?.*?<title>(.*?)</title>', text) == [
         ("5", "", "c.jpg"), ("4", "", "a.jpg"), ("1", ' class="weak"', "d.jpg"), ("0", "", "b.jpg"),
     ]  # fmt: skip
-    assert '<li class="problem">4 of 6 photos placed' in text and "<li>around d.jpg: fewer than 2 other" in text
+    assert '<li class="problem">4 of 6 photos placed' in text and "<li>Take more photos around d.jpg" in text
 
 
 @pytest.mark.parametrize(("placed", "said"), [(5, True), (6, False), (10, False)])
 def test_too_few_photos_are_said(placed, said):
-    text = unusable(_report(placed, 10))
+    text = why_unusable(_report(placed, 10))
     assert (text is not None) == said and (not said or "only 5 of 10 photos" in text)
 
 
 def test_a_training_says_what_its_scene_lacks(tmp_path):
-    assert left_out(tmp_path) is None
+    assert describe_left_out(tmp_path) is None
     path = tmp_path / "convert_report.json"
     path.write_text(json.dumps(_report(14, 30)))
-    assert left_out(tmp_path).startswith("this scene has 14 of 30 photos (47%) of its capture")
+    assert describe_left_out(tmp_path).startswith("this scene has 14 of 30 photos (47%) of its capture")
     path.write_text(json.dumps(_report(30, 30)))
-    assert left_out(tmp_path) is None
+    assert describe_left_out(tmp_path) is None
     path.write_text("[]")
-    assert left_out(tmp_path) is None
+    assert describe_left_out(tmp_path) is None
 
 
 @pytest.mark.parametrize(
@@ -170,10 +195,10 @@ def _model(registered: int, points: int = 5000, track: float = 5.0, error: float
 def test_poses_that_no_pair_judged_are_not_called_right():
     photos = [f"{i:03d}" for i in range(40)]
     words = [_model(40)], photos, dict.fromkeys(photos, 3), "auto", 0
-    (line,) = map(str, of_model(*words, tried=[{"way": "global", "photos": 40, "pairs": 0}]))
+    (line,) = map(str, check_reconstruction(*words, tried=[{"way": "global", "photos": 40, "pairs": 0}]))
     assert line.startswith("the poses could not be judged")
     judged = {"way": "global", "photos": 40, "pairs": 90, "agreeing": 40, "contradicting": 0.02}
-    assert [*of_model(*words, tried=[judged])] == []
+    assert [*check_reconstruction(*words, tried=[judged])] == []
 
 
 @pytest.mark.parametrize(
@@ -190,7 +215,7 @@ def test_poses_that_no_pair_judged_are_not_called_right():
 )
 def test_advice(models, said):
     photos = [f"{i:03d}" for i in range(40)]
-    lines = [*map(str, of_model(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192))]
+    lines = [*map(str, check_reconstruction(models, photos, dict.fromkeys(photos[:39], 3), "sequential", 8192))]
     assert [bool(re.search(expected, line)) for line, expected in zip(lines, said, strict=True)] == [True] * len(said)
 
 
@@ -198,5 +223,8 @@ def test_per_photo_is_not_advised_to_who_has_it():
     photos = [f"{i:03d}" for i in range(40)]
     wrong = {"way": "global", "photos": 40, "pairs": 90, "agreeing": 9, "contradicting": 0.9, "against": photos[:2]}
     words = [_model(25, error=9.0), _model(15, first=25)], photos, dict.fromkeys(photos, 9), "auto", 0, [wrong], 0
-    advised = [["per_photo" in line for line in map(str, of_model(*words, mode))] for mode in ("per_lens", "per_photo")]
+    advised = [
+        ["per_photo" in line for line in map(str, check_reconstruction(*words, mode))]
+        for mode in ("per_lens", "per_photo")
+    ]
     assert advised[0].count(True) == 4 and not any(advised[1])

@@ -21,7 +21,7 @@ from applications.convert.colmap import Pycolmap, Settings
 from applications.convert.images import check_images, prepare_images
 from applications.convert.layout import Layout, refuse_foreign_results
 from applications.convert.stages import reconstruction_stages
-from scene.checks.conversion import check_conversion, is_unfinished, left_out
+from scene.checks.conversion import check_conversion, describe_left_out, is_unfinished
 from scene.dataset_readers import read_scene
 from scene.readers.scene_folder import is_scene
 from scene.readers.tracks import read_tracks
@@ -132,8 +132,8 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
 
 def test_the_command_that_trains_can_be_copied(copy, monkeypatch, capsys):
     """It ends the output, unless too few photos are placed."""
-    inputs, found = convert.report_inputs, {"again": ["with a fixed exposure; else train with --appearance ppisp"]}
-    monkeypatch.setattr(convert, "report_inputs", lambda *a, **k: inputs(*a, **k) | found)
+    inputs, found = convert.record_inputs, {"again": ["Use a fixed exposure, or train these with --appearance ppisp"]}
+    monkeypatch.setattr(convert, "record_inputs", lambda *a, **k: inputs(*a, **k) | found)
     convert.main(["-s", str(copy), "--no_gpu", "--resize"])
     words = shlex.split(capsys.readouterr().out.splitlines()[-1].removeprefix("train it with: "))
     assert words[-7:] == ["-s", str(copy), "-m", f"output/{copy.name}", "--eval", "--appearance", "ppisp"]
@@ -314,7 +314,7 @@ def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
     assert folder_state(copy / "distorted") == work
     # A later failure keeps the scene too, and the record still knows that convert.py made it.
     with monkeypatch.context() as patch:
-        patch.setattr(stages, "refuse_nothing", lambda *_: (_ for _ in ()).throw(UserError("no model")))
+        patch.setattr(stages, "refuse_unplaced", lambda *_: (_ for _ in ()).throw(UserError("no model")))
         refused("no model", "--mapper", "global")
 
 
@@ -327,10 +327,10 @@ def test_a_verdict_outlives_an_interruption_and_train_finishes_what_was_begun(co
     """The folder is a scene only when photos and verdict are there, too."""
     verdict, again = "no way of mapping", ["-s", str(copy), "--no_gpu", "--lenses"]
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(stages.report, "unusable", lambda _: verdict)
+        patch.setattr(stages.report, "why_unusable", lambda _: verdict)
         patch.setattr(capture_page, "write_page", _interrupt)
         convert.main([*again, "native"])
-    assert verdict in left_out(copy) and is_scene(copy) and is_unfinished(copy)
+    assert verdict in describe_left_out(copy) and is_scene(copy) and is_unfinished(copy)
     assert [line for line in map(str, check_conversion(copy)) if f"says of this scene: {verdict}" in line]
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(stages.report, "write_report", _interrupt)

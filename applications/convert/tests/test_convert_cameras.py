@@ -12,7 +12,7 @@ from PIL import ExifTags, Image
 
 import convert
 from applications.convert import cameras
-from applications.convert.findings import of_shared_cameras
+from applications.convert.checks import check_shared_cameras
 from applications.convert.layout import Layout
 from scene.checks.cameras import check_lenses
 from scene.dataset_readers import read_scene
@@ -100,9 +100,9 @@ SHOTS = {
 def test_who_shares_a_camera(tmp_path, mode, found):
     for name, made in SHOTS.items():
         small(tmp_path / name, made, (8, 6) if "l" not in Path(name).stem else (6, 8))
-    groups = cameras.group(tmp_path, [*SHOTS], mode)
+    groups = cameras.group_photos(tmp_path, [*SHOTS], mode)
     assert ["".join(Path(name).stem for name in one.names) for one in groups] == found
-    said = cameras.listing(groups)
+    said = cameras.describe_groups(groups)
     if mode == "per_folder":
         assert f"  3 photos, 8 x 6 in x: Maker Phone 3, back, 4 mm (as 26 mm on 35 mm film) and {Lens()}" in said
     assert len(said.splitlines()) == (1 if mode == "per_photo" else len(found) + 1)
@@ -155,7 +155,7 @@ def survey(*factors: float, gain: float = 0.5) -> list[dict]:
 
 
 def _advice(*words) -> list[str]:
-    return [*map(str, of_shared_cameras(*words))]
+    return [*map(str, check_shared_cameras(*words))]
 
 
 @pytest.mark.parametrize(

@@ -127,8 +127,8 @@ def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, monkeypa
         for broken in ({name: value for name, value in entry.items() if name != key}, entry | {key: [[]]}):
             layout.frames.write_text(json.dumps([broken]))
             with contextlib.suppress(UserError):  # what it need not have
-                video_module.video_lines(layout)
-                video_module.report_entries(layout)
+                video_module.describe_videos(layout)
+                video_module.list_report_entries(layout)
     assert _frame_elsewhere.is_file()
     layout.frames.write_text(json.dumps([entry]))
     Image.open(frames[1]).rotate(90).save(frames[1])
@@ -212,7 +212,7 @@ def test_streams_of_a_video(ffmpeg, room, tmp_path, heights, folders, said):
     for name, first in folders.items():
         taken = [np.asarray(Image.open(path)) for path in sorted((layout.input / name).iterdir())]
         assert _places(room, taken) == list(range(4 * first, 4 * first + 4))
-    lines = video_module.video_lines(layout)
+    lines = video_module.describe_videos(layout)
     assert len(lines) == len(folders) and all(said in line for line in lines)
 
 
@@ -234,7 +234,7 @@ def test_frames_follow_the_motion(ffmpeg, room, tmp_path):
     pairs = zip(taken[:-1], taken[1:], strict=True)
     assert max(structural_similarity(one, other, channel_axis=2) for one, other in pairs) < 0.9
     assert _places(room, taken) == list(range(16))
-    (line,) = video_module.video_lines(layout)
+    (line,) = video_module.describe_videos(layout)
     assert line == "walk.mp4: 16 of 144 frames taken, not 40, since the others hardly differ"
     # Fewer than there are places: each of equal parts of the motion, not of the time, has one.
     layout = _extract(tmp_path / "few", tmp_path / "walk.mp4", 4)
@@ -307,7 +307,7 @@ def test_hdr_frames_look_like_those_of_the_sdr_video(ffmpeg, room, tmp_path, tra
         for got, expected in zip(taken.reshape(len(source), -1, 3), source.reshape(len(source), -1, 3), strict=True):
             assert got.mean(axis=0) == pytest.approx(expected.mean(axis=0), rel=0.03)
             assert got.std(axis=0) == pytest.approx(expected.std(axis=0), rel=0.03)
-        (line,) = video_module.video_lines(layout)
+        (line,) = video_module.describe_videos(layout)
         assert (f"; {name} was brought to SDR" in line) == (kind == "hdr.mov")
 
 
@@ -361,7 +361,7 @@ def test_interlaced_frames_are_not_combed_and_their_pixels_become_square(ffmpeg,
     assert _places(np.stack(stretched), frames) == list(range(0, 16, 2))
     errors = [np.abs(frame.astype(np.float32) - own).mean() for frame, own in zip(frames, stretched[::2], strict=True)]
     assert max(errors) < 6
-    (line,) = video_module.video_lines(layout)
+    (line,) = video_module.describe_videos(layout)
     assert "interlaced, so" in line and line.endswith("not square, so 240 x 180 became 320 x 180")
 
 

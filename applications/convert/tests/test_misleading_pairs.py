@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from applications.convert.findings import is_folded, is_wrong, only_turned
+from applications.convert.checks import is_folded, is_only_turned, is_wrong
 from scene.rotation_only import rotation_error
 from scene.unmatched import find_cover, find_overlaps
 
@@ -122,7 +122,7 @@ def test_a_camera_that_only_turns_is_told_from_one_that_moves(tmp_path, poses, p
     path = tmp_path / "database.db"
     _write(path, poses, lambda _: np.arange(len(points)), points)
     found = JUDGED | {"rotation": rotation_error(str(path))}
-    assert only_turned(found) == is_wrong(found) == turned
+    assert is_only_turned(found) == is_wrong(found) == turned
 
 
 def _unmatched(model: pycolmap.Reconstruction, path: Path) -> list[str]:

@@ -10,10 +10,10 @@ import pytest
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
-from applications.convert.georeference import level_up
+from applications.convert.georeference import find_level_up
 from applications.convert.layout import Layout
-from applications.convert.orienting import orient, said_of
-from gaussian_renderer.camera_paths.poses import facing
+from applications.convert.orienting import describe_orientation, orient_scene
+from gaussian_renderer.camera_paths.poses import look_along
 from groundwork.files.similarity import Similarity, read_orientation
 from scene.images.exif import _gps, read_place
 from utils.system_utils import UserError
@@ -29,7 +29,7 @@ def ring(rolls=()) -> tuple[np.ndarray, np.ndarray]:
     """Turns (N,3,3) and places (N,3), metres, of cameras that look down at the middle, in the level frame."""
     angles = 2 * np.pi * np.arange(COUNT) / COUNT
     places = 30 * np.stack([np.cos(angles), np.full(COUNT, -0.3), np.sin(angles)], axis=1)
-    turns = np.stack([facing(-place, np.array([0.0, -1, 0])) for place in places])
+    turns = np.stack([look_along(-place, np.array([0.0, -1, 0])) for place in places])
     for number, roll in enumerate(rolls):
         turns[number] = turns[number] @ Rotation.from_euler("z", roll, degrees=True).as_matrix()
     return turns, places
@@ -98,9 +98,9 @@ def converted(folder: Path, turns: np.ndarray, places: np.ndarray, exifs=None) -
 
 
 def oriented(layout: Layout) -> tuple[Similarity, dict]:
-    orient(layout)
+    orient_scene(layout)
     record = read_orientation(layout.scene)
-    return Similarity.of(record, "the record"), record
+    return Similarity.read(record, "the record"), record
 
 
 def test_a_tilted_scene_without_exif_data_becomes_level_in_its_own_unit(tmp_path):
@@ -109,13 +109,13 @@ def test_a_tilted_scene_without_exif_data_becomes_level_in_its_own_unit(tmp_path
     down = similarity.rotation @ TILT @ [0, 1, 0]
     np.testing.assert_allclose(down, [0, 1, 0], atol=2e-3)
     assert similarity.scale == 1 and record["unit"] == "scene" and "latitude" not in record
-    np.testing.assert_allclose(np.median(similarity.points(UNIT * places @ TILT.T + SHIFT), axis=0), 0, atol=1e-9)
-    assert "horizons of 12 photos; no scale" in said_of(layout)[0]
+    np.testing.assert_allclose(np.median(similarity.transform(UNIT * places @ TILT.T + SHIFT), axis=0), 0, atol=1e-9)
+    assert "horizons of 12 photos; no scale" in describe_orientation(layout)[0]
 
 
 def test_cameras_that_face_one_way_take_their_mean_up():
-    turns = np.repeat(facing(np.array([1.0, 0.3, 0]), np.array([0.0, -1, 0]))[None], 5, axis=0)
-    np.testing.assert_allclose(level_up(turns), -turns[0][:, 1], atol=1e-6)
+    turns = np.repeat(look_along(np.array([1.0, 0.3, 0]), np.array([0.0, -1, 0]))[None], 5, axis=0)
+    np.testing.assert_allclose(find_level_up(turns), -turns[0][:, 1], atol=1e-6)
 
 
 @pytest.mark.parametrize("lost", [0, 3])
@@ -129,13 +129,13 @@ def test_gps_gives_metres_and_north(tmp_path, lost):
     assert record["unit"] == "metre" and record["gps_photos"] == COUNT - lost
     assert similarity.scale * UNIT == pytest.approx(1, rel=0.02)  # 1 m / (30 m * sqrt(9)), twice
     np.testing.assert_allclose(similarity.rotation @ TILT, np.eye(3), atol=0.03)
-    moved = similarity.points(UNIT * places @ TILT.T + SHIFT)
+    moved = similarity.transform(UNIT * places @ TILT.T + SHIFT)
     middle = np.median(places, axis=0)
     np.testing.assert_allclose(moved, places - middle, atol=1.5)
     here = gps_of(middle[None])[0]
     found = similarity.place
     np.testing.assert_allclose(found[:2], here[:2], atol=2e-5)  # degrees, 2 m
-    assert found[2] == pytest.approx(here[2], abs=2) and "by GPS of" in said_of(layout)[0]
+    assert found[2] == pytest.approx(here[2], abs=2) and "by GPS of" in describe_orientation(layout)[0]
 
 
 def _told(gps: np.ndarray, how: str) -> list[np.ndarray | None]:
@@ -182,11 +182,11 @@ def test_flights_are_level_and_in_metres_or_say_that_they_are_not(
     off = np.degrees(np.arccos(min(similarity.rotation[1] @ TILT[:, 1], 1)))
     scaled = similarity.scale * UNIT - 1
     assert (record["vertical"] is not None, similarity.upright) == (known, known)
-    assert (off < 1) if known else "not known" in said_of(layout)[0] and not similarity.place
+    assert (off < 1) if known else "not known" in describe_orientation(layout)[0] and not similarity.place
     assert (record["unit"] == "metre") == (how != "no")
     assert how == "no" or abs(scaled) < max(0.01, 2 * record["scale_error"])
     if known and how != "no":
-        there = similarity.points(UNIT * places @ TILT.T + SHIFT)
+        there = similarity.transform(UNIT * places @ TILT.T + SHIFT)
         earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
         east_north = earth.ellipsoid_to_enu(gps_of(places, at), *similarity.place)[:, :2]
         np.testing.assert_allclose(there[:, ::2], east_north, atol=4)

@@ -18,12 +18,12 @@ from PIL import Image
 import convert
 import train
 from applications.convert import pairing, reduced
-from applications.convert.dense_points import more_points
+from applications.convert.dense_points import find_points
 from applications.convert.layout import Layout, find_images, take_photos_beside
-from applications.convert.pairing import first_pairs, likeness, named_by_id, restore_names, rounds
-from applications.convert.reduced import enlarged, longest_side, reduce_photos
+from applications.convert.pairing import choose_first_pairs, compute_likeness, name_by_id, plan_rounds, restore_names
+from applications.convert.reduced import choose_longest_side, read_enlarged, reduce_photos
 from applications.convert.stages import Stage, StageRecord
-from scene.checks.conversion import changed_photos, is_unfinished, state_of
+from scene.checks.conversion import describe_changed_photos, file_state, is_unfinished
 from scene.readers.scene_folder import REPORT, find_capture
 from utils.system_utils import UserError
 
@@ -63,17 +63,17 @@ def _verify(path: str, pairs: set[tuple[int, int]]) -> None:
 
 def test_photos_that_look_alike_are_found(database):
     with contextlib.closing(pycolmap.Database.open(database)) as made:
-        alike = likeness(made, [*range(1, PLACES * EACH + 1)])
+        alike = compute_likeness(made, [*range(1, PLACES * EACH + 1)])
     nearest = np.argsort(-alike, axis=1)[:, : EACH - 1]
     assert (nearest % PLACES == (np.arange(PLACES * EACH) % PLACES)[:, None]).all()
     nowhere = np.full((PLACES * EACH, 3), np.nan)
-    pairs = {pairing.ordered(*pair) for pair in first_pairs(alike, nowhere)}
+    pairs = {pairing.order_pair(*pair) for pair in choose_first_pairs(alike, nowhere)}
     assert {(0, 1), (0, PLACES), (0, 7 * PLACES)} <= pairs
     # Two that neither names nor looks bring together, but GPS does.
     assert (0, 55) not in pairs
     places = nowhere.copy()
     places[[0, 55]] = 0.5
-    assert (0, 55) in {pairing.ordered(*pair) for pair in first_pairs(alike, places)}
+    assert (0, 55) in {pairing.order_pair(*pair) for pair in choose_first_pairs(alike, places)}
 
 
 def test_gps_tells_who_is_near_beyond_180_degrees_and_at_a_pole():
@@ -84,7 +84,7 @@ def test_gps_tells_who_is_near_beyond_180_degrees_and_at_a_pole():
                            position=np.array(place), coordinate_system=world)
         for number, place in enumerate(given, 1)
     ]  # fmt: skip
-    places = pairing.gps_places(SimpleNamespace(read_all_pose_priors=lambda: priors), [1, 2, 3, 4])
+    places = pairing.read_gps_places(SimpleNamespace(read_all_pose_priors=lambda: priors), [1, 2, 3, 4])
     away = np.linalg.norm(places[::2] - places[1::2], axis=1)
     assert 20 < away[0] < 25 and 20 < away[1] < 25  # metres
 
@@ -92,7 +92,7 @@ def test_gps_tells_who_is_near_beyond_180_degrees_and_at_a_pole():
 def test_photos_outside_the_largest_group_are_tried_with_all_of_it(database):
     """Each place is a group of its own here, so the photos of all but one are tried with that one's."""
     done: set[tuple[int, int]] = set()
-    found = rounds(database, all_of=10)
+    found = plan_rounds(database, all_of=10)
     for pairs in found:
         assert not pairs & done
         _verify(database, pairs)
@@ -100,9 +100,9 @@ def test_photos_outside_the_largest_group_are_tried_with_all_of_it(database):
     group = {
         number
         for number in range(1, 81)
-        if number % PLACES == pairing.joined(pairing.bound_pairs(database)).pop() % PLACES
+        if number % PLACES == pairing.largest_component(pairing.find_bound_pairs(database)).pop() % PLACES
     }
-    assert {pairing.ordered(one, other) for one in range(1, 81) for other in group if one != other} <= done
+    assert {pairing.order_pair(one, other) for one in range(1, 81) for other in group if one != other} <= done
 
 
 def test_names_may_contain_blanks(database):
@@ -111,10 +111,10 @@ def test_names_may_contain_blanks(database):
             return [name for (name,) in connection.execute("SELECT name FROM images ORDER BY image_id")]
 
     before = names()
-    with named_by_id(database):
+    with name_by_id(database):
         assert names() == [str(number) for number in range(1, 81)]
     assert names() == before
-    with contextlib.suppress(KeyboardInterrupt), named_by_id(database):
+    with contextlib.suppress(KeyboardInterrupt), name_by_id(database):
         raise KeyboardInterrupt  # the process ended: nothing restores the names
     assert names() != before
     restore_names(database)
@@ -260,18 +260,18 @@ def test_photos_that_change_after_a_conversion_are_named(tmp_path):
     _fill(tmp_path, "a.jpg", "b.jpg", "c.jpg", "capture.html", size=1)
     (tmp_path / REPORT).write_text('{"unused": {"live.CR2": "same name"}}')
     record = StageRecord(tmp_path / "distorted" / "stages.json")
-    record.note("files", {name: state_of(tmp_path / name) for name in ("a.jpg", "b.jpg", "c.jpg")})
+    record.note("files", {name: file_state(tmp_path / name) for name in ("a.jpg", "b.jpg", "c.jpg")})
     record.run([Stage("capture", 1, lambda: None, lambda: None)])
     _fill(tmp_path, "live.CR2")
-    assert changed_photos(tmp_path) is None
+    assert describe_changed_photos(tmp_path) is None
     shutil.copytree(tmp_path, tmp_path / "copy", copy_function=shutil.copyfile)
-    assert changed_photos(tmp_path / "copy") is None
+    assert describe_changed_photos(tmp_path / "copy") is None
     (tmp_path / "a.jpg").rename(tmp_path / "d.jpg")
     _fill(tmp_path, "b.jpg", size=2)
     said = r": 1 new \(d.jpg\), 1 gone \(a.jpg\), 1 changed \(b.jpg\); .*run convert.py again, with the"
-    assert re.search(said, changed_photos(tmp_path))
+    assert re.search(said, describe_changed_photos(tmp_path))
     _fill(tmp_path, "input/e.jpg")
-    assert ": 1 new (e.jpg), 1 gone" in changed_photos(tmp_path)
+    assert ": 1 new (e.jpg), 1 gone" in describe_changed_photos(tmp_path)
 
 
 @pytest.mark.parametrize(("name", "mode"), [
@@ -305,7 +305,7 @@ def test_small_photos_are_linked_and_a_known_size_is_kept(tmp_path):
     assert (tmp_path / "small" / "a.png").samefile(tmp_path / "photos" / "a.png")
     reduce_photos(tmp_path / "photos", tmp_path / "other", ["a.png"], 100, (52, 30))
     assert Image.open(tmp_path / "other" / "a.png").size == (52, 30)
-    assert longest_side(reduced.FEW) > longest_side(reduced.FEW + 1)
+    assert choose_longest_side(reduced.FEW) > choose_longest_side(reduced.FEW + 1)
 
 
 def test_a_model_is_brought_to_the_size_of_its_photos(tmp_path):
@@ -321,7 +321,7 @@ def test_a_model_is_brought_to_the_size_of_its_photos(tmp_path):
         Image.new("RGB", (400, 240)).save(tmp_path / f"{number}.png")
     model.add_point3D(point, track, np.zeros(3, np.uint8))
     model.write(str(tmp_path))
-    found = enlarged(str(tmp_path), tmp_path)
+    found = read_enlarged(str(tmp_path), tmp_path)
     assert (found.cameras[1].width, found.cameras[1].height) == (400, 240)
     assert found.cameras[1].params == pytest.approx([360, 364, 200, 120, 0.1, 0, 0, 0])
     for image in found.images.values():
@@ -360,7 +360,7 @@ def _model(offset: np.ndarray) -> tuple[pycolmap.Reconstruction, dict[str, dict[
 def test_points_lie_on_the_walls(once, offset):
     photos: Path = once("six photos of a room", lambda folder: make_photos(folder, VIEWS))
     model, shared = _model(offset)
-    points, colors = more_points(model, photos, shared, torch.device("cpu"))
+    points, colors = find_points(model, photos, shared, torch.device("cpu"))
     # The walls are the planes x = 0, y = 0 and z = 0, some 4 units away, where a pixel is 0.02 units.
     off = np.abs(points - offset).min(axis=1)
     assert len(points) > 500 and colors.shape == points.shape and colors.dtype == np.uint8
@@ -375,5 +375,5 @@ def test_points_lie_on_the_walls(once, offset):
 
 def test_photos_that_share_nothing_give_no_points(once):
     photos: Path = once("six photos of a room", lambda folder: make_photos(folder, VIEWS))
-    points, colors = more_points(_model(np.zeros(3))[0], photos, {}, torch.device("cpu"))
+    points, colors = find_points(_model(np.zeros(3))[0], photos, {}, torch.device("cpu"))
     assert points.shape == colors.shape == (0, 3)

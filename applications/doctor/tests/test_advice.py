@@ -42,14 +42,14 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
     points = np.random.default_rng(0).normal(size=(30, 3))
     views = [SimpleNamespace(R=np.eye(3), T=np.array([0, 0, z]), fx=f) for z, f in ((100.0, 50.0), (400.0, 100.0))]
     tracks = [_track(points, np.arange(30)), None, _track(points, np.arange(30))]
-    assert abs(advice.distances([views[0], views[0], views[1]], tracks) - 2) < 0.05
+    assert abs(advice.measure_distance_ratio([views[0], views[0], views[1]], tracks) - 2) < 0.05
 
 
 def test_what_may_be_advised_is_measured():
     """In the table of what scenes gain that ask for it, or beside: nothing is recommended on other grounds."""
     measured = (advice.ROOT / "docs/results/options.md").read_text().partition("## One fault")[0]
     code = [inspect.getsource(tool) for name in ("advise", "advise_trained") for tool in tools(name)]
-    named = {*re.findall(r'"(--\w+)', "".join([*code, inspect.getsource(advice._of_tracks)]))}
+    named = {*re.findall(r'"(--\w+)', "".join([*code, inspect.getsource(advice._check_distances)]))}
     assert named == {"--antialiasing", "--appearance", "--refine_poses", "--robust_mask", "--sky"}
     assert all(f"`{name}" in measured for name in named)
 
@@ -68,7 +68,7 @@ def test_advice_on_a_given_option_or_against_one_is_not_taken(tmp_path, monkeypa
 
 def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves_no_process(tmp_path, capfd):
     with pytest.raises(UserError, match="^no scene$"):
-        advice._trained([sys.executable, "-c", "import sys; sys.exit(' 50%|##\\nx\\nerror: no scene')"])
+        advice._train([sys.executable, "-c", "import sys; sys.exit(' 50%|##\\nx\\nerror: no scene')"])
     assert capfd.readouterr().err == " 50%|##\n"
     number = tmp_path / "number"
     code = f"import os, time; open({str(number)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
@@ -85,7 +85,7 @@ def test_a_short_training_that_fails_says_why_and_one_that_is_interrupted_leaves
     threading.Thread(target=interrupt).start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            advice._trained([sys.executable, "-c", code])
+            advice._train([sys.executable, "-c", code])
     finally:
         signal.signal(signal.SIGINT, before)
     with pytest.raises(ProcessLookupError):

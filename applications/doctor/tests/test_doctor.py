@@ -21,11 +21,11 @@ import doctor
 from applications.doctor import environment
 from applications.doctor.model import check_model
 from arguments import ModelParams, read_cfg_args, write_cfg_args, write_model_json
-from benchmarks.scenes.poses import disturbed
+from benchmarks.scenes.poses import disturb_poses
 from gaussian_renderer import render
 from groundwork.finding import Finding, fine
-from scene.checks.cameras import check_extent, of_cameras
-from scene.checks.points import of_points
+from scene.checks.cameras import check_cameras, check_extent
+from scene.checks.points import check_points
 from scene.checks.scene import check_dataset
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
@@ -76,7 +76,7 @@ def test_extensions_that_do_not_fit(monkeypatch, tmp_path):
         return environment._check_extension("simple-knn").line
 
     monkeypatch.setattr(environment, "ROOT", tmp_path)
-    monkeypatch.setattr(environment, "_version", versions.get)
+    monkeypatch.setattr(environment, "_read_version", versions.get)
     assert check() == "ok      extension simple-knn 0.1.0+cu13"
     (package / "ops.py").write_text("changed")
     assert "installed from other sources than these (ops.py) -> run `pip install ./submodules/simple-knn`" in check()
@@ -120,9 +120,9 @@ def test_cameras_that_stand_or_look_oddly(info):
         scaled = _with_cameras(info, lambda _, camera, f=factor: {"T": camera.T * f}, info.extent * factor)
         assert remedy in problems(check_extent(scaled))[0]
     name = info.train_cameras[3].image_name
-    (line,) = _said(of_cameras(_with_cameras(info, lambda i, c: {"T": c.T + 200 * (i == 3)}, 50.0)))
+    (line,) = _said(check_cameras(_with_cameras(info, lambda i, c: {"T": c.T + 200 * (i == 3)}, 50.0)))
     assert f"1 of 17 cameras are more than 10 times as far from the middle as the median camera ({name})" in line
-    (line,) = _said(of_cameras(_with_cameras(info, lambda _, c: {"T": -c.R.T @ np.ones(3)})))
+    (line,) = _said(check_cameras(_with_cameras(info, lambda _, c: {"T": -c.R.T @ np.ones(3)})))
     assert "all cameras stand in one place" in line
 
 
@@ -142,7 +142,7 @@ def test_poses_of_another_form_without_points(blender_scene, change, text):
         edit_json(file, lambda content: [f.update(transform_matrix=change(np.array(f["transform_matrix"])).tolist())
                                          for f in content["frames"]])  # fmt: skip
     found = read_scene(blender_scene, "images", hold_out=False)
-    said = [*_said(of_cameras(found)), *problems(check_extent(found))]
+    said = [*_said(check_cameras(found)), *problems(check_extent(found))]
     assert [line[: len(text)] for line in said] == [text] * bool(text)
 
 
@@ -156,23 +156,23 @@ def _with_cloud(info, points: np.ndarray):
 
 def test_points_and_cameras_that_do_not_meet(info):
     many = np.random.default_rng(0).normal(scale=0.2, size=(2000, 3)).astype(np.float32)
-    assert _said(of_points(_with_cloud(info, many))) == []
+    assert _said(check_points(_with_cloud(info, many))) == []
     half_turn = np.diag([-1.0, 1.0, -1.0])
     turned = lambda camera: {"R": camera.R @ half_turn, "T": half_turn @ camera.T}  # noqa: E731
     away = _with_cloud(_with_cameras(info, lambda _, camera: turned(camera)), many)
     assert (
         "100% of the points are in no photo: poses and points do not belong together; check the scale, and "
-        in (_said(of_points(away))[0])
+        in (_said(check_points(away))[0])
     )
-    assert _said(of_points(dataclasses.replace(away, has_random_points=True))) == []
+    assert _said(check_points(dataclasses.replace(away, has_random_points=True))) == []
     few = _with_cloud(_with_cameras(info, lambda i, camera: turned(camera) if i % 4 == 0 else {}), many)
-    assert "5 cameras have hardly any point in view" in (line := _said(of_points(few))[0]) and "remove" not in line
+    assert "5 cameras have hardly any point in view" in (line := _said(check_points(few))[0]) and "remove" not in line
     one = _with_cloud(_with_cameras(info, lambda i, camera: {} if i else turned(camera)), many)
     name = info.train_cameras[0].image_name
-    assert f"1 cameras have hardly any point in view ({name})" in _said(of_points(one))[0]
+    assert f"1 cameras have hardly any point in view ({name})" in _said(check_points(one))[0]
     far = many.copy()
     far[::20] = 1e5
-    assert "5.0% of the points are more than 100 extents away" in _said(of_points(_with_cloud(info, far)))[0]
+    assert "5.0% of the points are more than 100 extents away" in _said(check_points(_with_cloud(info, far)))[0]
 
 
 def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
@@ -188,7 +188,7 @@ def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
 def test_poses_that_tracks_correct(colmap_scene, tmp_path):
     """Turned and moved, with points and photos as they are. No better pose is near one that is far from the model's."""
     for number, (degrees, percent, said) in enumerate([(0, 0, ""), (0.3, 0.5, "better poses"), (9, 20, "3 degrees")]):
-        folder = disturbed(colmap_scene, tmp_path / str(number), degrees, percent, 1)
+        folder = disturb_poses(colmap_scene, tmp_path / str(number), degrees, percent, 1)
         lines = [line for line in problems(check_dataset(str(folder), "images")) if "from where photos show" in line]
         assert len(lines) == bool(said) and said in "".join(lines)
         if "better" in said:

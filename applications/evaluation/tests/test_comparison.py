@@ -9,18 +9,18 @@ from report_runs import run_of, set_runs
 
 import train
 from applications.evaluation.comparison import (
+    average_scenes,
+    choose_default_set,
     compare,
-    default_set,
-    published_tables,
-    scene_means,
-    spread,
-    stand_apart,
+    mark_apart,
+    read_published,
     summarise,
+    summarise_spread,
 )
-from applications.evaluation.configs import read_configs, shipped
+from applications.evaluation.configs import list_shipped, read_configs
 from applications.evaluation.plan import DATASETS
 from applications.evaluation.report import make_report
-from applications.evaluation.tables import result_tables
+from applications.evaluation.tables import make_result_tables
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[3]
@@ -28,9 +28,9 @@ ROOT = Path(__file__).parents[3]
 
 def test_spread():
     std = pytest.approx(statistics.stdev([1, 2, 4]))
-    assert spread([1.0, 2.0, 4.0]) == {"mean": pytest.approx(7 / 3), "std": std, "values": [1.0, 2.0, 4.0]}
-    assert spread([5.0])["std"] is None and spread([5.0])["mean"] == 5.0
-    assert spread([5.0, None])["mean"] is None and spread([])["mean"] is None
+    assert summarise_spread([1.0, 2.0, 4.0]) == {"mean": pytest.approx(7 / 3), "std": std, "values": [1.0, 2.0, 4.0]}
+    assert summarise_spread([5.0])["std"] is None and summarise_spread([5.0])["mean"] == 5.0
+    assert summarise_spread([5.0, None])["mean"] is None and summarise_spread([])["mean"] is None
 
 
 def test_means_over_the_scenes_that_compare():
@@ -38,18 +38,18 @@ def test_means_over_the_scenes_that_compare():
     other = [run | {"seed": run["seed"] + 5} for run in set_runs("brick") if run["config"] == "fast"]
     runs = [*set_runs(), *(run for run in set_runs("brick") if run["config"] == "adc"), *other]
     runs[2] = runs[2] | {"iterations": {"30": runs[2]["iterations"]["30"] | {"gaussians": None}}}
-    adc, fast = scene_means(summarise(stand_apart(runs)))  # and `small` is of one scene
+    adc, fast = average_scenes(summarise(mark_apart(runs)))  # and `small` is of one scene
     assert (adc["scene"], adc["config"], adc["scenes"], adc["seeds"]) == ("mean of 2 scenes", "adc", 2, [0, 1])
-    assert adc["PSNR"] == spread([31.0, 31.4]) and fast["seeds"] == [None] and fast["PSNR"]["mean"] == 32.2
+    assert adc["PSNR"] == summarise_spread([31.0, 31.4]) and fast["seeds"] == [None] and fast["PSNR"]["mean"] == 32.2
     assert fast["PSNR"]["std"] is None and fast["gaussians"]["mean"] is None
-    (table,) = result_tables([adc, fast])
+    (table,) = make_result_tables([adc, fast])
     assert table.rows[0][:4] == ["mean of 2 scenes", "adc", "30", "31.20 ± 0.28"] and table.rows[1][-1] == "-"
     runs[-2:] = [run | {"ground_truth_sha256": "b" * 64} for run in runs[-2:]]  # `fast` of a scene
-    assert [mean["config"] for mean in scene_means(summarise(stand_apart(runs)))] == ["adc"]
+    assert [mean["config"] for mean in average_scenes(summarise(mark_apart(runs)))] == ["adc"]
     tanks = [run | {"group": "tanksandtemples"} for name in ("truck", "train") for run in set_runs(name)]
-    assert {mean["scene"] for mean in scene_means(summarise(tanks))} == {"mean of tanksandtemples"}
+    assert {mean["scene"] for mean in average_scenes(summarise(tanks))} == {"mean of tanksandtemples"}
     part = [run | {"group": "mipnerf360", "open_ended": True} for name in ("garden", "room") for run in set_runs(name)]
-    (mean, *_) = scene_means(summarise(part))
+    (mean, *_) = average_scenes(summarise(part))
     assert mean["scene"] == "mean of 2 scenes of mipnerf360" and mean["iteration"] is None
 
 
@@ -70,12 +70,12 @@ def test_a_set_that_stands_apart_is_told_why(change, why):
     runs[4:] = [run | other | change for run in runs[4:]]
     if None in change.values():
         runs[2:4] = [runs[2] | other]
-    marked = stand_apart(runs)
+    marked = mark_apart(runs)
     assert {run["config"] for run in marked if run["apart"]} >= {"small"}
     assert marked[-1]["why_apart"] == why and marked[0]["why_apart"] is None
     report = make_report(["full_eval.py"], runs)
     assert "small" not in str(report["gains"])
-    _, table = result_tables(report["summary"])
+    _, table = make_result_tables(report["summary"])
     assert f"attic, small: {why}." in table.title and "small" in [row[1] for row in table.rows]
 
 
@@ -89,13 +89,13 @@ def test_seeds_that_end_by_themselves_share_a_row():
     (row,) = (row for row in rows if row["config"] == "adc-20s")
     assert row["iterations"] == [20, 40] and row["iteration"] == 30 and row["seeds"] == [0, 1]
     assert row["PSNR"]["values"] == [22.0, 24.0]
-    (table,) = result_tables(rows)
+    (table,) = make_result_tables(rows)
     assert dict(zip(table.header, table.rows[-1], strict=True))["iteration"] == "20 to 40"
 
 
 def test_published_scenes_add_up_to_the_published_means():
     """Two tables of the paper were transcribed by hand: each mean over scenes must be the printed mean."""
-    table = published_tables()[0]
+    table = read_published()[0]
     assert set(table["scenes"]) == {name for scenes in DATASETS.values() for name in scenes}
     for group, by_iteration in table["means"].items():
         for iteration, means in by_iteration.items():
@@ -119,14 +119,20 @@ def test_synthetic_scenes_compare_at_full_size_over_white_only(change):
 
 
 def test_shipped_sets_are_options_of_training(tmp_path, monkeypatch):
-    assert "strategies" in shipped()
+    assert "strategies" in list_shipped()
     guide = (ROOT / "docs" / "guide" / "many_scenes.md").read_text().splitlines()
     described = {name for line in guide if line.startswith("| `") for name in line.split("|")[1].split("`")[1::2]}
-    for name in shipped():
+    for name in list_shipped():
         sets = read_configs(Path(name), train.parse)
         assert len(sets) > 1 and set(sets) <= described, "many_scenes.md does not tell what these are for"
-    assert default_set(read_configs(Path("strategies"), None)) == "adc" == default_set({"defaults": [], "adc": []})
-    assert default_set({"fast": [], "defaults": []}) == "defaults" and default_set({"x": [], "y": []}) == "x"
+    assert (
+        choose_default_set(read_configs(Path("strategies"), None))
+        == "adc"
+        == choose_default_set({"defaults": [], "adc": []})
+    )
+    assert (
+        choose_default_set({"fast": [], "defaults": []}) == "defaults" and choose_default_set({"x": [], "y": []}) == "x"
+    )
     assert read_configs(Path("strategies"), None)["adc"] == ()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "strategies").write_text(json.dumps({"mine": []}))  # a file comes first

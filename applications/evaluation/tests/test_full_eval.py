@@ -25,7 +25,7 @@ from waiting import LIMIT, wait_for
 import full_eval
 from applications.evaluation import report as report_module
 from applications.evaluation.child import Finished, Slot, run_child
-from applications.evaluation.plan import DATASETS, dataset_scenes, photos_of
+from applications.evaluation.plan import DATASETS, dataset_scenes, describe_photos
 from arguments import write_cfg_args
 from groundwork.host.interrupt import DeferredInterrupt
 from splatting.records.figures import draw_curves
@@ -45,7 +45,7 @@ BASE_AND_SH1 = '{"base": [], "sh1": ["--sh_degree", 1]}'
 
 @pytest.fixture(autouse=True)
 def _stand_ins(monkeypatch):
-    monkeypatch.setattr(full_eval, "facts_asked", lambda: MACHINE)
+    monkeypatch.setattr(full_eval, "facts_from_process", lambda: MACHINE)
     for name in ("draw_curves", "draw_sizes"):
         monkeypatch.setattr(report_module, name, lambda *_: [])  # half a second each; see `figures`
 
@@ -156,7 +156,7 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path, capsys):
     assert [row["table"].partition(" ")[0] for row in garden] == ["Kerbl", "official", "Deng", "3DGS-MCMC,"]
     assert {(row["photos"], garden[2]["hardware"]) for row in garden} == {("images_4", "RTX 4090 GPU")}
     assert {entry.options for entry in dataset_scenes("mipnerf360", mip, resize=True)} == {("-r", "4"), ("-r", "2")}
-    assert photos_of(["--eval", "-r", "4", "--test_iterations", "-1"]) == "images, resized by -r 4"
+    assert describe_photos(["--eval", "-r", "4", "--test_iterations", "-1"]) == "images, resized by -r 4"
     assert "LPIPS" not in garden[0]["numbers"] and garden[0]["other_options"] == switches  # our LPIPS is null
     means = {(row["scene"], row["iteration"]) for row in report["published"] if row["scene"].startswith("mean")}
     assert "images_4, images_2" in [row["photos"] for row in report["published"]]
@@ -346,10 +346,10 @@ def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
 def test_what_many_trainings_said_stands_once():
     known = {"scene": "attic", "config": None, "model": "m"}
     seeds = [known | {"seed": n, "lines": [f"Cut: {0.1**n:g}"]} for n in range(6)]
-    said = report_module._said([*seeds, known | {"seed": 6, "lines": None}])
+    said = report_module._list_closing_lines([*seeds, known | {"seed": 6, "lines": None}])
     title = "attic, seed 0; attic, seed 1; attic, seed 2; attic, seed 3 and 2 more"
     assert said == [(title, "Cut: 1, of which others have other numbers")]  # 1e-05, for one
-    assert report_module._said(seeds) == []
+    assert report_module._list_closing_lines(seeds) == []
 
 
 def test_seeds_of_different_ground_truth(evaluate):

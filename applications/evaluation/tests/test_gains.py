@@ -5,16 +5,16 @@ import pytest
 from report_runs import run_of
 from scipy import stats
 
-from applications.evaluation.gains import gains, holm, interval, verdict
+from applications.evaluation.gains import compute_gains, compute_interval, correct_holm, judge_gain
 from applications.evaluation.report import make_report
-from applications.evaluation.tables import gains_table
+from applications.evaluation.tables import make_gains_table
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_intervals_are_those_of_a_paired_t_test(seed):
     random = np.random.default_rng(seed)
     one, other = random.normal(30, 1, 7), random.normal(30.2, 1, 7)
-    found, test = interval((one - other).tolist()), stats.ttest_rel(one, other)
+    found, test = compute_interval((one - other).tolist()), stats.ttest_rel(one, other)
     bounds = test.confidence_interval(0.95)
     assert found["p"] == pytest.approx(test.pvalue)
     assert (found["mean"] - found["half"], found["mean"] + found["half"]) == pytest.approx(tuple(bounds))
@@ -24,13 +24,13 @@ def test_intervals_are_those_of_a_paired_t_test(seed):
 def test_what_so_many_seeds_can_show(count, seen):
     """Of differences that vary by 0.3 dB."""
     spread = np.linspace(-1, 1, count)
-    assert interval((0.3 * spread / spread.std(ddof=1)).tolist())["half"] == pytest.approx(seen, abs=0.005)
+    assert compute_interval((0.3 * spread / spread.std(ddof=1)).tolist())["half"] == pytest.approx(seen, abs=0.005)
 
 
 def test_holms_correction():
     """By hand: the smallest times 4, the next times 3, and never less than the one before."""
-    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
-    assert holm([]) == [] and holm([0.7]) == [0.7] and holm([0.6, 0.9]) == [1.0, 1.0]
+    assert correct_holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert correct_holm([]) == [] and correct_holm([0.7]) == [0.7] and correct_holm([0.6, 0.9]) == [1.0, 1.0]
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_holms_correction():
     ],
 )
 def test_verdicts(differences, said):
-    assert verdict(interval(differences)) == said
+    assert judge_gain(compute_interval(differences)) == said
 
 
 def _runs(scene: str, **ends: list[float]) -> list[dict]:
@@ -62,13 +62,16 @@ def test_seeds_are_paired_and_scenes_corrected_together():
     runs = _runs("attic", none=base, option=better, single=base[:1]) + _runs(
         "barn", none=base, option=[30.1, 30.9, 29.1]
     )
-    found = gains(runs)
+    found = compute_gains(runs)
     assert found["attic"]["default"] == "none" and list(found["attic"]["sets"]) == ["option"]
     row = found["attic"]["sets"]["option"]
-    alone = interval([0.5, 0.52, 0.54])
+    alone = compute_interval([0.5, 0.52, 0.54])
     assert row["mean"] == pytest.approx(0.52) and row["half"] == pytest.approx(alone["half"])
     assert row["p"] == pytest.approx(2 * alone["p"]) and row["verdict"] == "gains" and row["seeds"] == 3
-    table = gains_table(found["attic"])
+    table = make_gains_table(found["attic"])
     assert table.rows == [["option", "3", "+0.52 ± 0.05", "gains"]]
-    assert gains(_runs("attic", none=base)) == {} and gains(_runs("attic", none=[30.0], option=[31.0])) == {}
+    assert (
+        compute_gains(_runs("attic", none=base)) == {}
+        and compute_gains(_runs("attic", none=[30.0], option=[31.0])) == {}
+    )
     assert make_report(["full_eval.py"], runs)["gains"] == found

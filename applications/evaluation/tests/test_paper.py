@@ -7,7 +7,7 @@ from statistics import fmean
 
 from report_runs import run_of, set_runs
 
-from applications.evaluation.paper import csv_text, tex_text
+from applications.evaluation.paper import format_csv, format_tex
 from applications.evaluation.report import make_report
 
 
@@ -16,7 +16,7 @@ def test_a_row_for_each_run_and_for_each_mean():
     both = run_of("one, two", 0, (10, 20.0, 100), (20, 21.0, 200))
     both["iterations"] |= {"10": both["iterations"]["20"] | {"PSNR": 20.5, "ply_mb": None}, "15": {"views": 0}}
     report = make_report(["x"], [*set_runs("attic"), *set_runs("brick"), failed, both])
-    rows = list(csv.DictReader(io.StringIO(csv_text(report))))
+    rows = list(csv.DictReader(io.StringIO(format_csv(report))))
     assert {len(row) for row in rows} == {26} and len(rows) == 12 + 1 + 2 + 3
     runs, means = [row for row in rows if row["scenes"] == "1"], [row for row in rows if row["scenes"] == "2"]
     first, mean = runs[0], means[0]
@@ -35,7 +35,7 @@ def test_tables_that_tex_reads():
     """By TeX's rules; pdflatex compiled the same in an article, with the package booktabs and without."""
     name = "a--b_% #&$~^{x} <é>|\n地\\\udce9"
     other = run_of(name, 1, (10, 20.0, 100), scene="brick", ground_truth_sha256="b" * 64)
-    text = tex_text(make_report(["x"], [*set_runs("attic"), *set_runs("brick"), other]))
+    text = format_tex(make_report(["x"], [*set_runs("attic"), *set_runs("brick"), other]))
     assert text.replace("é", "").isascii() and "\n\n" not in text and "--" not in text
     assert text.count("{") - text.count(r"\{") == text.count("}") - text.count(r"\}")
     main, apart = re.findall(r"\\begin\{table\}.*?\\end\{table\}", text, re.DOTALL)

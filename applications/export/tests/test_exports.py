@@ -19,7 +19,7 @@ from scipy.spatial import KDTree, cKDTree
 from small_splats import COUNT, FAR, cube, empty_spz, extreme_splats, moved, splats, written
 
 from applications.export import scene_formats
-from applications.export.formats import FORMATS, format_of
+from applications.export.formats import FORMATS, find_format
 from gaussian_renderer.free_view import rotation_matrix
 from scene.export_world import export_world
 from scene.splats.ply import CHUNK
@@ -336,8 +336,8 @@ def test_selection():
 
 def test_unknown_endings_and_files_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"format of a.obj is unknown; end its name with one of mesh.ply, mesh.glb, "):
-        format_of("a.obj")
-    assert format_of("A.Compressed.PLY").ending == ".compressed.ply" and format_of("b.ply").ending == ".ply"
+        find_format("a.obj")
+    assert find_format("A.Compressed.PLY").ending == ".compressed.ply" and find_format("b.ply").ending == ".ply"
     assert len({entry.ending for entry in FORMATS}) == len(FORMATS)
     with pytest.raises(UserError, match="no file"):
         read_splats(tmp_path / "absent.spz")

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from arguments import PipelineParams
 from gaussian_renderer import render
-from gaussian_renderer.camera_paths.poses import facing, keyframe
+from gaussian_renderer.camera_paths.poses import keyframe, look_along
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from scene.splats.reading import read_splats
@@ -59,7 +59,7 @@ def orbit(means: np.ndarray) -> list[MiniCam]:
     views = []
     for angle in np.arange(5) * 2 * np.pi / 5 + 0.3:
         offset = np.array([np.sin(angle), -0.3, np.cos(angle)])
-        pose = keyframe(0.0, middle + radius * offset, facing(-offset, np.array([0.0, -1.0, 0.0])), 0.0)
+        pose = keyframe(0.0, middle + radius * offset, look_along(-offset, np.array([0.0, -1.0, 0.0])), 0.0)
         views.append(free_view(64, 64, 0.9, pose.position, pose.wxyz, compute_device()))
     return views
 

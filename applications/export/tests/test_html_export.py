@@ -12,7 +12,7 @@ from html_page import Page
 from html_scene import CENTRE, FOV, UP, balls, cameras
 
 from applications.export import html, vendor
-from applications.export.html import settings, turn_upright, up_of, write_html
+from applications.export.html import find_up, make_settings, turn_upright, write_html
 from applications.export.notes import Note, Notes
 from gaussian_renderer.camera_paths.generated import Ellipse
 from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe, KeyframePath
@@ -104,33 +104,33 @@ def test_the_model_in_the_page_is_upright(page, tmp_path):
 
 def test_up_is_where_the_horizons_are_level():
     ring = poses_of(cameras(rolls=()))
-    assert up_of(ring) == pytest.approx(UP, abs=1e-6)
+    assert find_up(ring) == pytest.approx(UP, abs=1e-6)
     side = ring[np.arange(3)]  # all look down from one side, so that their mean up leans to it
     assert math.degrees(math.acos(side.up @ UP / np.linalg.norm(side.up))) > 8
-    assert up_of(side) == pytest.approx(UP, abs=1e-2)
+    assert find_up(side) == pytest.approx(UP, abs=1e-2)
     one = ring[np.zeros(4, int)]
-    assert up_of(one) == pytest.approx(one.up, abs=1e-6)
+    assert find_up(one) == pytest.approx(one.up, abs=1e-6)
 
 
 def test_the_first_camera_is_where_the_page_begins(page):
     content = json.loads(page.texts["page"])["settings"]
     first = content["cameras"][0]["initial"]
     pose = poses_of(cameras())
-    axes = np.diag([-1.0, -1.0, 1.0]) @ turn_upright(up_of(pose))
+    axes = np.diag([-1.0, -1.0, 1.0]) @ turn_upright(find_up(pose))
     assert first["position"] == pytest.approx(axes @ pose.positions[0], abs=1e-6)
     assert first["target"] == pytest.approx(axes @ CENTRE, abs=1e-4) and first["fov"] == pytest.approx(FOV, abs=1e-4)
     marks = content["annotations"]
     assert [mark["title"] for mark in marks] == [f"View {n} of 8" for n in range(1, 9)]
     assert marks[0]["camera"]["initial"] == first
     leans = [mark["extras"]["lean"] for mark in marks]
-    assert leans[0] == pytest.approx(-12, abs=4) and np.abs(leans[1:]).max() < 3  # that camera also moves `up_of`
+    assert leans[0] == pytest.approx(-12, abs=4) and np.abs(leans[1:]).max() < 3  # that camera also moves `find_up`
 
 
 def test_the_animation_follows_the_camera_path():
     poses = poses_of(cameras())
 
     def track(path) -> dict:
-        content = settings(poses, [""] * len(poses), np.eye(3), path, (0, 0, 0))
+        content = make_settings(poses, [""] * len(poses), np.eye(3), path, (0, 0, 0))
         assert content["startMode"] == "animTrack"
         return content["animTracks"][0]
 

@@ -8,7 +8,7 @@ import export
 import train
 from applications.demo.make_scene import make_scene
 from gaussian_renderer.blending import weighted_sums
-from gaussian_renderer.camera_paths.without_scene import circle
+from gaussian_renderer.camera_paths.without_scene import circle_cameras
 from gaussian_renderer.importance import change_without, most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
@@ -42,7 +42,7 @@ def _score(scene: Scene, which: torch.Tensor, to_model: bool) -> float:
 def test_changes_are_those_of_a_removal():
     """Up to what is below 1/255, or above the cap of an alpha."""
     gaussians = model(40, degree=1)
-    camera = circle(gaussians.get_xyz.detach().numpy())[0]
+    camera = circle_cameras(gaussians.get_xyz.detach().numpy())[0]
     image = VIEWS.image(camera, gaussians)
     change = change_without(image, gaussians, torch.ones_like(image))
     for k in change.abs().argsort(descending=True)[:10]:

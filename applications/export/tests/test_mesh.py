@@ -18,11 +18,25 @@ import export
 import train
 from applications.demo.make_scene import make_scene
 from applications.export import html, mesh
-from applications.export.formats import Around, format_of
-from applications.export.mesh import Mesh, fewer, measure, mesh_of, vertex_normals, volume_of, zero_level
-from applications.export.mesh_cleaning import broad, large_parts, rim_edges, smooth_rims, whole_parts
+from applications.export.formats import SceneInputs, find_format
+from applications.export.mesh import (
+    Mesh,
+    extract_zero_level,
+    fuse_volume,
+    make_mesh,
+    measure_surfaces,
+    reduce_triangles,
+    vertex_normals,
+)
+from applications.export.mesh_cleaning import (
+    find_rim_edges,
+    keep_large_parts,
+    keep_whole_parts,
+    smooth_rims,
+    trim_narrow_parts,
+)
 from applications.export.mesh_files import write_ply_mesh
-from applications.export.surfaces import Surfaces, pinholes
+from applications.export.surfaces import Surfaces, make_pinholes
 from benchmarks.exports import mesh as benchmark
 from gaussian_renderer.median_depth import surface_of
 from scene.gaussian_model import GaussianModel
@@ -68,7 +82,7 @@ def views() -> list:
 
 @pytest.fixture(scope="module")
 def of_ball(ball, views) -> Mesh:
-    return mesh_of(*measure(ball, views, pipeline(), VOXEL))[0]
+    return make_mesh(*measure_surfaces(ball, views, pipeline(), VOXEL))[0]
 
 
 def test_the_median_depth_is_that_of_the_surface_in_front(views):
@@ -96,11 +110,11 @@ def test_a_mesh_lies_on_the_surface_and_faces_outwards(of_ball):
 
 def test_chunks_have_no_seams(ball, views, monkeypatch):
     """Of blocks one by one, the mesh has the same edges with one triangle as of all at once."""
-    volume, open_edges, sizes = volume_of(Surfaces(ball, views, pipeline()), VOXEL), [], []
+    volume, open_edges, sizes = fuse_volume(Surfaces(ball, views, pipeline()), VOXEL), [], []
     for side in (16, 1):
         monkeypatch.setattr(mesh, "_CHUNK", side)
-        vertices, faces, _ = zero_level(volume, 3)
-        open_edges.append(len(rim_edges(faces, len(vertices))))
+        vertices, faces, _ = extract_zero_level(volume, 3)
+        open_edges.append(len(find_rim_edges(faces, len(vertices))))
         sizes.append((len(vertices), len(faces)))
     assert open_edges[0] == open_edges[1] and sizes[0] == sizes[1]
 
@@ -118,7 +132,7 @@ def test_small_parts_are_left_out_and_large_ones_kept():
         start += len(points)
     vertices, faces = np.concatenate(parts), np.concatenate(faces).astype(np.int32)
     weights = np.where(vertices[:, 2] == 3, 30, 1)  # which has more pixels in photos than its triangles tell
-    kept, left = large_parts(vertices, faces, weights)
+    kept, left = keep_large_parts(vertices, faces, weights)
     assert sorted(set(kept[:, 2])) == [0.0, 3.0] and len(left) == 4004
     assert left.max() == len(kept) - 1
 
@@ -134,22 +148,22 @@ def grid(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_rims_lose_their_tongues_and_become_smooth():
     vertices, faces = grid(20)
-    kept = broad(faces, len(vertices))
+    kept = trim_narrow_parts(faces, len(vertices))
     # The tongue may leave a stub, and corners become round.
     assert vertices[kept][..., 1].max() < 13 < vertices[faces][..., 1].max() and len(kept) > 0.9 * 2 * 200
     jagged = vertices.copy()
     jagged[:, 1] += np.where((vertices[:, 1] == 0) & (vertices[:, 0] % 2 == 0), 0.4, 0)
     smooth = smooth_rims(jagged, faces)
     assert np.ptp(smooth[(vertices[:, 1] == 0) & (abs(vertices[:, 0] - 10) < 8), 1]) < 0.05
-    inner = np.setdiff1d(faces, rim_edges(faces, len(vertices)))
+    inner = np.setdiff1d(faces, find_rim_edges(faces, len(vertices)))
     np.testing.assert_array_equal(smooth[inner], jagged[inner])
 
 
 def test_a_surface_needs_the_views_that_it_is_asked_for(ball, views):
-    volume = volume_of(Surfaces(ball, views[:2], pipeline()), VOXEL)
-    assert len(zero_level(volume, 2)[1]) > 100
+    volume = fuse_volume(Surfaces(ball, views[:2], pipeline()), VOXEL)
+    assert len(extract_zero_level(volume, 2)[1]) > 100
     with pytest.raises(UserError, match="the training views show no surface"):
-        zero_level(volume, 3)
+        extract_zero_level(volume, 3)
 
 
 def sheets(count: int, points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -162,7 +176,7 @@ def sheets(count: int, points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_fewer_triangles_lie_on_the_same_surface(of_ball):
-    vertices, faces = fewer(of_ball.vertices, of_ball.faces, 500)
+    vertices, faces = reduce_triangles(of_ball.vertices, of_ball.faces, 500)
     away = vertices - CENTRE
     distances = np.linalg.norm(away, axis=1)
     assert 400 < len(faces) <= 500 and abs(distances - RADIUS).mean() < 0.02
@@ -170,16 +184,16 @@ def test_fewer_triangles_lie_on_the_same_surface(of_ball):
     whole = trimesh.creation.icosphere(3)
     whole = np.float32(whole.vertices), np.int32(whole.faces)
     with pytest.raises(UserError, match="--triangles 1 leaves nothing of the mesh; give more"):
-        fewer(*whole, 1)
-    assert len(fewer(*sheets(40, 4), 100)[1]) <= 100
+        reduce_triangles(*whole, 1)
+    assert len(reduce_triangles(*sheets(40, 4), 100)[1]) <= 100
     with pytest.raises(
         UserError, match=r"--triangles 100 is too few for the rims of this mesh; give \d+ or more"
     ) as too_few:
-        fewer(*sheets(200, 3), 100)
+        reduce_triangles(*sheets(200, 3), 100)
     most = int(str(too_few.value).split()[-3])
-    assert 100 < len(fewer(*sheets(200, 3), most)[1]) <= most
+    assert 100 < len(reduce_triangles(*sheets(200, 3), most)[1]) <= most
     with pytest.raises(UserError, match="all surfaces are too narrow for a mesh; give a smaller --voxel"):
-        whole_parts(of_ball.vertices, of_ball.faces[:2], np.ones(len(of_ball.vertices)))
+        keep_whole_parts(of_ball.vertices, of_ball.faces[:2], np.ones(len(of_ball.vertices)))
 
 
 def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
@@ -188,7 +202,7 @@ def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
     words = ["-s", str(tmp_path / "scene"), "-m", str(tmp_path / "model"), "--ply", "a.ply", "--to", "b.ply"]
     options = models.extract(export.parse(parser, [*words, "--lenses", "native"]))
     cameras = Scene(options, GaussianModel(0), shuffle=False, start=False).getTrainCameras()
-    for view, camera in zip(pinholes(cameras), cameras, strict=True):
+    for view, camera in zip(make_pinholes(cameras), cameras, strict=True):
         assert camera.lens is not None and getattr(view, "lens", None) is None
         assert view.FoVy == pytest.approx(np.radians(60))
         torch.testing.assert_close(view.world_view_transform, camera.world_view_transform, rtol=0, atol=1e-5)
@@ -208,7 +222,7 @@ def of_two_halves(ball, views) -> Mesh:
     """A mesh with a texture, of a ball that is green on one side and red on the other."""
     sh = np.where(ball.means[:, None, None, 0] > CENTRE[0], np.array([0.1, 0.7, 0.1]), np.array([0.7, 0.1, 0.1]))
     halves = replace(ball, sh=((sh.reshape(-1, 1, 3) - 0.5) / C0).astype(np.float32))
-    return mesh_of(*measure(halves, views, pipeline(), VOXEL), 1000, True)[0]
+    return make_mesh(*measure_surfaces(halves, views, pipeline(), VOXEL), 1000, True)[0]
 
 
 def read_usdz(path: Path) -> tuple[np.ndarray, ...]:
@@ -240,13 +254,13 @@ def read_by_trimesh(path: Path) -> tuple[np.ndarray, ...]:
 
 @pytest.mark.parametrize("ending", ["glb", "obj", "usdz"])
 def test_other_programs_read_meshes_with_their_textures(tmp_path, monkeypatch, ending, ball, of_two_halves):
-    monkeypatch.setattr("applications.export.mesh.measure", lambda *_: ())
-    monkeypatch.setattr("applications.export.mesh.mesh_of", lambda *_: (of_two_halves, ""))
+    monkeypatch.setattr("applications.export.mesh.measure_surfaces", lambda *_: ())
+    monkeypatch.setattr("applications.export.mesh.make_mesh", lambda *_: (of_two_halves, ""))
     path = tmp_path / f"a ball.mesh.{ending}"
-    entry = format_of(path)
+    entry = find_format(path)
     for _ in range(2):  # its own files are not in its way
         entry.check(path)
-        entry.write(path, ball, Around((), (0, 0, 0), pipeline()))
+        entry.write(path, ball, SceneInputs((), (0, 0, 0), pipeline()))
     points, faces, normals, uv, texture = (read_usdz if ending == "usdz" else read_by_trimesh)(path)
     turn = [1, -1, -1]  # y up
     corners = of_two_halves.vertices[of_two_halves.faces] * turn
@@ -265,33 +279,33 @@ def test_an_obj_spares_foreign_files_beside_it(tmp_path):
         other = tmp_path / f"a.mesh.{ending}"
         other.write_text("mine")
         with pytest.raises(UserError, match=rf"no export wrote .*a.mesh.{ending}"):
-            format_of("a.mesh.obj").check(tmp_path / "a.mesh.obj")
+            find_format("a.mesh.obj").check(tmp_path / "a.mesh.obj")
         other.unlink()
     with pytest.raises(UserError, match="names the files beside it in UTF-8, which .* is not; choose another --to"):
-        format_of("a.mesh.obj").check(tmp_path / "caf\udce9.mesh.obj")
+        find_format("a.mesh.obj").check(tmp_path / "caf\udce9.mesh.obj")
 
 
 def test_too_small_voxels_are_refused_or_enlarged(ball, views, monkeypatch):
     monkeypatch.setattr(mesh, "MOST_VOXELS", 60_000)
     some = Surfaces(ball, views[:4], pipeline())
     with pytest.raises(UserError, match=r"--voxel 0.04 makes more than 0 million voxels.*; give .* or more") as refused:
-        volume_of(some, 0.04)
-    volume_of(some, float(str(refused.value).split()[-3]))
+        fuse_volume(some, 0.04)
+    fuse_volume(some, float(str(refused.value).split()[-3]))
     for voxel in (1e-3, 1e-300):
         with pytest.raises(UserError, match=rf"--voxel {voxel:g} is far below a pixel, .*; give .* or more") as refused:
-            volume_of(some, voxel)
+            fuse_volume(some, voxel)
         assert 0.05 < float(str(refused.value).split()[-3]) < 0.5
-    volume = volume_of(some)
+    volume = fuse_volume(some)
     assert len(volume.keys) * 512 <= 60_000
 
 
 def test_without_surfaces_there_is_no_mesh(ball, views):
     ball.opacity_logits[:], before = -4.0, ball.opacity_logits.copy()
     with pytest.raises(UserError, match="no training view shows anything opaque"):
-        mesh_of(*measure(ball, views, pipeline(), VOXEL))
+        make_mesh(*measure_surfaces(ball, views, pipeline(), VOXEL))
     ball.opacity_logits[:] = before
     with pytest.raises(UserError, match="a mesh needs training cameras"):
-        measure(ball, [], pipeline(), VOXEL)
+        measure_surfaces(ball, [], pipeline(), VOXEL)
 
 
 @pytest.fixture(scope="module")
@@ -318,15 +332,15 @@ def test_the_mesh_of_a_traced_scene_lies_on_its_surfaces(trained, monkeypatch, c
 
 def test_files_of_one_call_share_what_is_slow(ball, views, tmp_path, monkeypatch):
     """Surfaces of all meshes, the mesh of those with a texture, and the packed model of pages."""
-    made, pages, around = [], [], Around(views, (0, 0, 0), pipeline(), voxel=2 * VOXEL, made={})
-    for name in ("volume_of", "textured"):
+    made, pages, around = [], [], SceneInputs(views, (0, 0, 0), pipeline(), voxel=2 * VOXEL, made={})
+    for name in ("fuse_volume", "make_texture"):
         plain = getattr(mesh, name)
         monkeypatch.setattr(mesh, name, lambda *a, n=name, f=plain: made.append(n) or f(*a))
-    monkeypatch.setattr(html, "_packed_model", lambda splats: pages.append(splats) or "")
+    monkeypatch.setattr(html, "_pack_model", lambda splats: pages.append(splats) or "")
     for name in ("mesh.ply", "a.mesh.glb", "b.mesh.obj", "a.html", "b.html"):
-        format_of(name).write(tmp_path / name, ball, around)
+        find_format(name).write(tmp_path / name, ball, around)
         assert (tmp_path / name).stat().st_size > 1000
-    assert made == ["volume_of", "textured"] and len(pages) == 1
+    assert made == ["fuse_volume", "make_texture"] and len(pages) == 1
 
 
 @pytest.mark.slow
@@ -353,5 +367,5 @@ def test_export_writes_meshes(trained, monkeypatch, tmp_path, capsys):
 
 
 def test_meshes_have_names_of_their_own():
-    assert format_of("out/mesh.ply").options == format_of("room.MESH.glb").options == ("voxel", "triangles")
-    assert format_of("out/meshes.ply").options == ()
+    assert find_format("out/mesh.ply").options == find_format("room.MESH.glb").options == ("voxel", "triangles")
+    assert find_format("out/meshes.ply").options == ()

@@ -13,12 +13,12 @@ from PIL import Image
 
 import export
 import train
-from applications.export.formats import Around, format_of
-from applications.export.page_start import PICTURE, named, write_preview
+from applications.export.formats import SceneInputs, find_format
+from applications.export.page_start import PICTURE, find_named, write_preview
 from gaussian_renderer import render
 from gaussian_renderer.camera_paths import without_scene
 from gaussian_renderer.camera_paths.poses import Poses, poses_of
-from gaussian_renderer.camera_paths.start import LEAST, MOST, best_start, narrowed
+from gaussian_renderer.camera_paths.start import LEAST, MOST, best_start, narrow_fov
 from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
 from splatting import cleaning
@@ -46,9 +46,9 @@ def test_a_page_begins_at_a_usual_camera_that_looks_at_the_middle():
 
 def test_a_start_is_named_with_or_without_its_ending():
     names = [f"photo_{n}.jpg" for n in range(8)]
-    assert named("photo_3.jpg", names, "") == named("photo_3", names, "") == 3
+    assert find_named("photo_3.jpg", names, "") == find_named("photo_3", names, "") == 3
     with pytest.raises(UserError, match=r"--start photo is no training photo; there are photo_0.jpg, .* and 3 more"):
-        named("photo", names, "--start photo")
+        find_named("photo", names, "--start photo")
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_start_is_named_with_or_without_its_ending():
     ],
 )
 def test_a_photo_fills_a_window_unless_that_hides_much_of_it(photo, window, heights):
-    assert math.tan(narrowed(math.radians(40), photo, window) / 2) == pytest.approx(
+    assert math.tan(narrow_fov(math.radians(40), photo, window) / 2) == pytest.approx(
         heights * math.tan(math.radians(20))
     )
 
@@ -75,7 +75,7 @@ def test_the_picture_beside_a_link_is_the_first_one(tmp_path):
     write_preview(tmp_path / "page.jpg", splats, camera, pipeline(), (0.2, 0.4, 0.3))
     shown = np.asarray(Image.open(tmp_path / "page.jpg"), np.float64)
     assert shown.shape == (*PICTURE[::-1], 3)
-    poses, fov = poses_of([camera]), narrowed(math.radians(FOV), SIZE[0] / SIZE[1], PICTURE[0] / PICTURE[1])
+    poses, fov = poses_of([camera]), narrow_fov(math.radians(FOV), SIZE[0] / SIZE[1], PICTURE[0] / PICTURE[1])
     view = free_view(*PICTURE, fov, poses.positions[0].tolist(), poses.quaternions[0].tolist(), "cpu")
     with torch.no_grad():
         image = render(view, model_of(splats), pipeline(), torch.tensor([0.2, 0.4, 0.3]))["render"]
@@ -84,9 +84,9 @@ def test_the_picture_beside_a_link_is_the_first_one(tmp_path):
 
 def test_a_title_is_text_whatever_it_holds(tmp_path):
     title = "<script>alert(1)</script> & \"quotes'"
-    around = Around(cameras(), (0.0, 0.0, 0.0), pipeline(), None, None, "photo_5", title)
+    around = SceneInputs(cameras(), (0.0, 0.0, 0.0), pipeline(), None, None, "photo_5", title)
     path = tmp_path / "my page #1.html"  # a photo "my page #1.jpg" beside it would stay
-    format_of(path).write(path, balls(), around)
+    find_format(path).write(path, balls(), around)
     page, meta = Page(path), _meta(path)
     assert page.texts["title"] == meta["og:title"] == title and "alert(1)</script>" not in path.read_text()
     assert meta["og:type"] == "website" and meta["og:image"] == "my%20page%20%231.html.jpg"

@@ -15,23 +15,23 @@ from scipy.spatial.transform import Rotation
 from small_splats import extreme_splats, splats
 
 from applications.export import streamed, tiles3d
-from applications.export.formats import Around, format_of
-from applications.export.grouping import groups_of
-from applications.export.levels import GROUP, joined, losses, octree
-from applications.export.merging import areas, footprints, merged
+from applications.export.formats import SceneInputs, find_format
+from applications.export.grouping import group_splats
+from applications.export.levels import GROUP, build_octree, join_splats, measure_losses
+from applications.export.merging import footprints, merge_groups, shadow_areas
 from applications.export.sog import PROGRAM, run_program
-from gaussian_renderer.camera_paths.without_scene import circle
+from gaussian_renderer.camera_paths.without_scene import circle_cameras
 from scene.splats.reading import read_splats
 from scene.splats.splats import Splats, opacities, selected
 from utils.system_utils import UserError
 
 
-def _around(some: Splats) -> Around:
-    return Around(circle(some.means)[:1], (0.0, 0.0, 0.0), pipeline(), None, None)
+def _around(some: Splats) -> SceneInputs:
+    return SceneInputs(circle_cameras(some.means)[:1], (0.0, 0.0, 0.0), pipeline(), None, None)
 
 
 def _written(path: Path, some: Splats) -> dict:
-    format_of(path).write(path, some, _around(some))
+    find_format(path).write(path, some, _around(some))
     return json.loads(path.read_text())
 
 
@@ -43,8 +43,8 @@ def _judged_covariances(some: Splats) -> np.ndarray:
 
 def test_merging_keeps_the_moments_of_each_group():
     some, starts = splats(50, 2), np.array([0, 1, 9, 30])
-    one, spread = merged(some, starts)
-    weights = opacities(some) * areas(np.exp(some.log_scales.astype(np.float64)))
+    one, spread = merge_groups(some, starts)
+    weights = opacities(some) * shadow_areas(np.exp(some.log_scales.astype(np.float64)))
     ours, judged = _judged_covariances(one), _judged_covariances(some)
     for k, rows in enumerate(np.split(np.arange(50), starts[1:])):
         share = weights[rows] / weights[rows].sum()
@@ -61,29 +61,29 @@ def test_merging_keeps_the_moments_of_each_group():
 
 
 def test_areas_are_those_of_shadows():
-    np.testing.assert_allclose(areas(np.array([[2.0, 2, 2]])), np.pi * 4)
+    np.testing.assert_allclose(shadow_areas(np.array([[2.0, 2, 2]])), np.pi * 4)
     # A disc's shadows have half of its area in the mean.
-    np.testing.assert_allclose(areas(np.array([[3.0, 3, 1e-9]])), np.pi * 9 / 2, rtol=0.012)
+    np.testing.assert_allclose(shadow_areas(np.array([[3.0, 3, 1e-9]])), np.pi * 9 / 2, rtol=0.012)
 
 
 @pytest.mark.parametrize("count", [1, 4, 5, 63, 1000])
 def test_groups_are_full_and_close(count):
     some = splats(count, 0)
-    order, starts = groups_of(some, 4)
+    order, starts = group_splats(some, 4)
     sizes = np.diff(np.append(starts, count))
     assert sorted(order) == list(range(count)) and len(starts) == -(-count // 4)
     assert starts[0] == 0 and sizes.min() >= 1 and sizes.max() <= 4
     if count == 1000:
-        assert merged(selected(some, order), starts)[1].mean() < merged(some, starts)[1].mean() / 2
+        assert merge_groups(selected(some, order), starts)[1].mean() < merge_groups(some, starts)[1].mean() / 2
 
 
 def test_every_gaussian_is_in_one_leaf_and_levels_shrink():
     some = splats(3000, 1)
     some.means[7] = [1e6, 0, 0]
-    root = octree(some, most=200)
+    root = build_octree(some, most=200)
     leaves = [tile for tile in root.all() if not tile.children]
     assert max(len(leaf.splats) for leaf in leaves) <= 200
-    together = joined([leaf.splats for leaf in leaves])
+    together = join_splats([leaf.splats for leaf in leaves])
     for name in ("means", "log_scales", "opacity_logits"):
         one, other = (np.sort(getattr(each, name), axis=0) for each in (together, some))
         np.testing.assert_array_equal(one, other)
@@ -93,7 +93,7 @@ def test_every_gaussian_is_in_one_leaf_and_levels_shrink():
     counts = [sum(len(tile.splats) for tile in root.level(depth)) for depth in range(root.levels)]
     assert counts == sorted(counts) and counts[-1] == 3000
     copies = selected(some, np.zeros(500, int))
-    assert not octree(copies, most=200).children  # which no cell can split
+    assert not build_octree(copies, most=200).children  # which no cell can split
 
 
 def _corners(box: list[float]) -> tuple[np.ndarray, np.ndarray]:
@@ -116,7 +116,7 @@ def _positions(path: Path) -> np.ndarray:
 
 
 def test_tilesets_are_as_3d_tiles_asks(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=150))
+    monkeypatch.setattr(tiles3d, "build_octree", lambda some: build_octree(some, most=150))
     some = splats(1000, 1)
     tileset = _written(tmp_path / "tileset.json", some)
     assert tileset["asset"]["version"] == "1.1" and tileset["root"]["refine"] == "REPLACE"
@@ -149,12 +149,12 @@ def test_tilesets_are_as_3d_tiles_asks(tmp_path, monkeypatch, capsys):
 
 def test_tiles_of_cesium_have_spz_in_place_of_attributes(tmp_path, monkeypatch):
     """All that CesiumJS 1.145 asks for; tests/browser/test_tiles.py shows them in it."""
-    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=150))
+    monkeypatch.setattr(tiles3d, "build_octree", lambda some: build_octree(some, most=150))
     some = splats(400, 2)
     tileset = _written(tmp_path / "cesium.json", some)
     both = ["KHR_gaussian_splatting", "KHR_gaussian_splatting_compression_spz_2"]
     assert tileset["extensions"]["3DTILES_content_gltf"] == {"extensionsUsed": both, "extensionsRequired": both}
-    for tile in octree(some, most=150).all():
+    for tile in build_octree(some, most=150).all():
         content = next(tmp_path.rglob(f"{tile.name}.glb")).read_bytes()
         (size,) = struct.unpack_from("<I", content, 12)
         gltf, count = json.loads(content[20 : 20 + size]), len(tile.splats)
@@ -177,7 +177,7 @@ def test_places_on_the_globe_are_those_of_colmap(place):
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap has no wheel for this platform")
     earth = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
     points = np.random.default_rng(0).normal(scale=1000, size=(20, 3))  # metres east, north, up
-    transform = np.reshape(tiles3d.on_globe(place), (4, 4)).T
+    transform = np.reshape(tiles3d.place_on_globe(place), (4, 4)).T
     found = points @ transform[:3, :3].T + transform[:3, 3]
     np.testing.assert_allclose(found, earth.enu_to_ecef(points, *place), rtol=0, atol=1e-6)
     assert transform[3].tolist() == [0, 0, 0, 1]
@@ -185,12 +185,12 @@ def test_places_on_the_globe_are_those_of_colmap(place):
 
 def test_only_the_root_knows_the_place_on_the_globe(tmp_path, monkeypatch):
     """GLB that told it, too, would be turned: x y z were east, down, north, and are east, north, up in tiles."""
-    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=30))
+    monkeypatch.setattr(tiles3d, "build_octree", lambda some: build_octree(some, most=30))
     some = dataclasses.replace(splats(60, 0), place=(47.25, 8.5, 410.0))
     tileset = _written(tmp_path / "tileset.json", some)
-    assert tileset["root"]["transform"] == tiles3d.on_globe(some.place)
+    assert tileset["root"]["transform"] == tiles3d.place_on_globe(some.place)
     assert not any("transform" in tile for tile in tileset["root"]["children"])
-    for tile in octree(some, most=30).all():
+    for tile in build_octree(some, most=30).all():
         found = _positions(next(tmp_path.rglob(f"{tile.name}.glb")))
         np.testing.assert_allclose(found, tile.splats.means[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
     assert "transform" not in _written(tmp_path / "tileset.json", splats(60, 0))["root"]
@@ -252,7 +252,7 @@ def test_a_failed_tileset_leaves_the_earlier_one(tmp_path, monkeypatch):
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    for name in ("write_glb", "document"):
+    for name in ("write_glb", "make_document"):
         with monkeypatch.context() as patch, pytest.raises(UserError, match="No space left"):
             patch.setattr(tiles3d, name, full)
             _written(path, splats(30, 0))
@@ -270,7 +270,7 @@ NEAR = selected(extreme_splats(), np.arange(7))  # SPZ cannot hold the last one
     ],
 )
 def test_empty_and_extreme_models_have_tilesets(tmp_path, some, monkeypatch, name):
-    monkeypatch.setattr(tiles3d, "octree", lambda some: octree(some, most=2))
+    monkeypatch.setattr(tiles3d, "build_octree", lambda some: build_octree(some, most=2))
     tileset = _written(tmp_path / name, some)
     assert ("content" in tileset["root"]) == bool(len(some))
     assert np.isfinite(tileset["root"]["boundingVolume"]["box"]).all()
@@ -284,9 +284,9 @@ def test_tiles_of_cesium_refuse_positions_that_spz_cannot_hold(tmp_path):
 
 def test_finer_levels_lose_less():
     some = splats(1200, 0)
-    root = octree(some, most=60)
+    root = build_octree(some, most=60)
     around = _around(some)
-    found = losses(root, around.cameras, around.background, argparse.Namespace(**vars(around.pipe)))
+    found = measure_losses(root, around.cameras, around.background, argparse.Namespace(**vars(around.pipe)))
     scores = [level["psnr"] for level in found]
     assert scores[-1] is None and scores[:-1] == sorted(scores[:-1]) and scores[0] > 5
     assert all(level["photos"] is None for level in found) and torch.is_grad_enabled()
@@ -294,10 +294,10 @@ def test_finer_levels_lose_less():
 
 @pytest.mark.skipif(not shutil.which(PROGRAM), reason=f"{PROGRAM} is not on PATH: npm i -g @playcanvas/splat-transform")
 def test_streamed_sog_has_every_level(tmp_path, monkeypatch):
-    monkeypatch.setattr(streamed, "octree", lambda some: octree(some, most=250))
+    monkeypatch.setattr(streamed, "build_octree", lambda some: build_octree(some, most=250))
     some, path = splats(400, 0), tmp_path / "out" / "lod-meta.json"
     content = _written(path, some)
-    root = octree(some, most=250)
+    root = build_octree(some, most=250)
     counts = [sum(len(tile.splats) for tile in root.level(depth)) for depth in range(root.levels)]
     assert content["counts"] == counts[::-1] and content["lodLevels"] == root.levels
     (finest,) = (name for name in content["filenames"] if "/0_" in name)

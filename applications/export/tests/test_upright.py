@@ -19,12 +19,12 @@ from scipy.spatial.transform import Rotation
 
 import export
 import train
-from applications.export.formats import Around, format_of
+from applications.export.formats import SceneInputs, find_format
 from applications.export.html import write_html
 from applications.export.mesh import Mesh
 from applications.export.mesh_files import write_glb_mesh
 from applications.export.scene_formats import write_glb
-from applications.export.upright import check_upright, moved_around, moved_cameras, moved_splats, placed
+from applications.export.upright import check_upright, move_cameras, move_inputs, move_splats, move_upright
 from gaussian_renderer import render
 from gaussian_renderer.camera_paths.poses import poses_of
 from groundwork.files.json_files import read_model_json
@@ -56,16 +56,16 @@ def rendered(splats, camera) -> np.ndarray:
         return render(camera, model_of(splats), pipeline(), torch.zeros(3))["render"].numpy()
 
 
-def around(make_path=None) -> Around:
+def around(make_path=None) -> SceneInputs:
     known = {"cameras": cameras(), "background": (0.0, 0.0, 0.0), "make_path": make_path}
-    return Around(**{name: known.get(name) for name in Around._fields})
+    return SceneInputs(**{name: known.get(name) for name in SceneInputs._fields})
 
 
 @pytest.mark.parametrize("scale", [2.5, 0.02])
 def test_a_moved_model_looks_the_same_from_a_moved_camera(scale):
     """Of SH degree 3. Float32 rounds to other values, so few weights pass the rasterizer's cutoff of 1/255, or fail."""
     similarity, splats, camera = replace(SOME, scale=scale), balls(degree=3), cameras()[1]
-    moved, (other,) = moved_splats(splats, similarity), moved_cameras([camera], similarity)
+    moved, (other,) = move_splats(splats, similarity), move_cameras([camera], similarity)
     before, after = rendered(splats, camera), rendered(moved, other)
     assert before.max() > 0.5 and 10 * math.log10(1 / np.square(before - after).mean()) > 80
     assert np.abs(before - after).max() < 2 / 255
@@ -78,8 +78,8 @@ def test_large_coordinates_lose_nothing():
     offset = np.array([455000.25, 5412000.5, 300.0])
     world = Similarity(TURN, 2.5, -2.5 * TURN @ (offset + 0.125))
     splats = replace(balls(degree=0), world_offset=tuple(offset))
-    moved = moved_splats(splats, world.from_local(offset))
-    expected = world.points(splats.means.astype(np.float64) + offset)
+    moved = move_splats(splats, world.from_local(offset))
+    expected = world.transform(splats.means.astype(np.float64) + offset)
     np.testing.assert_allclose(moved.means, expected, atol=2e-6)
     assert moved.world_offset == (0, 0, 0) and np.abs(moved.means).max() < 10
 
@@ -92,14 +92,14 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
     (tmp_path / "model.json").write_text(json.dumps({"similarity": record, "world_offset": [1.0, 2.0, 3.0]}))
     splats = replace(balls(), world_offset=(1.0, 2.0, 3.0))
-    moved = SOME.points(splats.means.astype(np.float64) + [1.0, 2.0, 3.0])
+    moved = SOME.transform(splats.means.astype(np.float64) + [1.0, 2.0, 3.0])
     for of_scene, options, is_moved in (
         (True, {}, True),
         (True, {"no_upright": True}, False),
         (False, {}, False),
         (False, {"upright": True}, True),
     ):
-        found, _ = placed(_args(tmp_path, **options), of_scene, splats, None)
+        found, _ = move_upright(_args(tmp_path, **options), of_scene, splats, None)
         np.testing.assert_allclose(found.means, moved if is_moved else splats.means, atol=1e-5)
     check_upright(_args(tmp_path, upright=True))
     with pytest.raises(UserError, match="contradict"):
@@ -108,8 +108,8 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     (tmp_path / "model.json").write_text(json.dumps({"similarity": unknown}))
     with pytest.raises(UserError, match="found no vertical"):
         check_upright(_args(tmp_path, upright=True))
-    found = Similarity.of(unknown, "it")
-    assert not moved_around(around(), found).upright and moved_around(around(), SOME).upright
+    found = Similarity.read(unknown, "it")
+    assert not move_inputs(around(), found).upright and move_inputs(around(), SOME).upright
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_a_similarity_that_leaves_no_scene_is_refused(tmp_path, change):
     record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5], **change}
     (tmp_path / "model.json").write_text(json.dumps({"similarity": record}))
     (tmp_path / "orientation.json").write_text(json.dumps(record))
-    for read in (lambda: placed(_args(tmp_path), True, balls(), None), lambda: read_orientation(tmp_path)):
+    for read in (lambda: move_upright(_args(tmp_path), True, balls(), None), lambda: read_orientation(tmp_path)):
         with pytest.raises(UserError, match="no rotation, scale and translation of a similarity that a scene may"):
             read()
 
@@ -144,7 +144,7 @@ def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, mon
         monkeypatch.setattr(sys, "argv", ["export.py", "-m", str(model), "--to", str(tmp_path / f"{name}.ply"), *more])
         export.main()
     plain, upright = (read_splats(tmp_path / f"{name}.ply") for name in ("plain", "upright"))
-    np.testing.assert_allclose(upright.means, SOME.points(plain.means), atol=1e-5)
+    np.testing.assert_allclose(upright.means, SOME.transform(plain.means), atol=1e-5)
     monkeypatch.setattr(export, "load", lambda *_: pytest.fail("this is refused before anything is loaded"))
     monkeypatch.setattr(sys, "argv", [*sys.argv, "--no_upright"])
     with pytest.raises(UserError, match="contradict"):
@@ -162,7 +162,7 @@ def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scen
         export.main()
         written.append(read_splats(tmp_path / f"{name}.ply").means)
         (colmap_scene / "orientation.json").write_text(json.dumps(record))
-    np.testing.assert_allclose(written[1], SOME.points(written[0]), atol=1e-5)
+    np.testing.assert_allclose(written[1], SOME.transform(written[0]), atol=1e-5)
     assert "poses are not those" not in capsys.readouterr().err
     record = json.loads((model / "cameras.json").read_text())
     for entry in record:  # as if the scene had got other poses since
@@ -182,7 +182,7 @@ def textured(points: np.ndarray) -> Mesh:
 @pytest.mark.parametrize("kind", ["splats", "mesh"])
 def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
     """-x of the turned node is east, y up, z north (README of EXT_georeference); x, y, z were east, down, north."""
-    splats = replace(moved_splats(balls(), replace(SOME, place=place)), world_offset=(0.0, 0.0, 0.0))
+    splats = replace(move_splats(balls(), replace(SOME, place=place)), world_offset=(0.0, 0.0, 0.0))
     if kind == "mesh":
         triangle = textured(np.eye(3, dtype=np.float32))
         write_glb_mesh(tmp_path / "x.glb", triangle, splats)
@@ -206,11 +206,11 @@ def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
     """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
     points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
     mesh = replace(textured(points), colors=np.zeros((3, 3), np.uint8))
-    monkeypatch.setattr("applications.export.mesh.measure", lambda *_: ())
-    monkeypatch.setattr("applications.export.mesh.mesh_of", lambda *_: (mesh, "a triangle"))
+    monkeypatch.setattr("applications.export.mesh.measure_surfaces", lambda *_: ())
+    monkeypatch.setattr("applications.export.mesh.make_mesh", lambda *_: (mesh, "a triangle"))
     for ending, expected in (("ply", points[:, [0, 2, 1]] * [1, 1, -1] if upright else points), ("glb", points)):
         path = tmp_path / f"mesh.{ending}"
-        format_of(path).write(path, balls(), around()._replace(upright=upright))
+        find_format(path).write(path, balls(), around()._replace(upright=upright))
         if ending == "ply":
             read = PlyData.read(path)["vertex"]
             found = np.column_stack([read[name] for name in "xyz"])
@@ -223,7 +223,7 @@ def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
 
 def test_a_page_takes_the_vertical_of_the_similarity(tmp_path):
     """Also where the cameras' horizons, all tilted here, say otherwise: the page's model is the moved one."""
-    moved, places = moved_splats(balls(), SOME), moved_around(around(), SOME)
+    moved, places = move_splats(balls(), SOME), move_inputs(around(), SOME)
     settings = {}
     for name, value in (("kept", places), ("found", places._replace(upright=False))):
         write_html(tmp_path / f"{name}.html", moved, value.cameras, upright=value.upright)

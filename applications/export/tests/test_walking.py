@@ -8,8 +8,8 @@ import pytest
 from gaussians import pipeline
 from room_scene import HALF, HIGH, STEP, cameras, room
 
-from applications.export.upright import moved_splats
-from applications.export.walking import LEAF, SOLID, Solid, metres_of, octree, solid_of
+from applications.export.upright import move_splats
+from applications.export.walking import LEAF, SOLID, Solid, encode_octree, make_solid, measure_metre
 from groundwork.files.similarity import Similarity
 from utils.system_utils import UserError
 
@@ -47,12 +47,15 @@ def test_an_octree_has_the_voxels_that_it_was_made_of():
     every = np.stack(np.meshgrid(*[np.arange(-24, 44)] * 3, indexing="ij"), -1).reshape(-1, 3)
     tried = np.concatenate([voxels, every[rng.choice(len(every), 3000, replace=False)]])
     there = {tuple(voxel) for voxel in voxels.tolist()}
-    assert solid_at(octree(voxels, 0.1), 0.1 * tried) == [tuple(voxel) in there for voxel in tried.tolist()]
-    assert solid_at(octree(np.array([[3, 4, 5]]), 0.1), np.array([[0.3, 0.4, 0.5], [0.5, 0.4, 0.5]])) == [True, False]
+    assert solid_at(encode_octree(voxels, 0.1), 0.1 * tried) == [tuple(voxel) in there for voxel in tried.tolist()]
+    assert solid_at(encode_octree(np.array([[3, 4, 5]]), 0.1), np.array([[0.3, 0.4, 0.5], [0.5, 0.4, 0.5]])) == [
+        True,
+        False,
+    ]
 
 
 def test_a_room_is_solid_at_its_walls_floor_and_step_alone():
-    solid = solid_of(room(), cameras(), pipeline())
+    solid = make_solid(room(), cameras(), pipeline())
     around = np.array([(x, y, z) for x in (-2, 2) for y in (0.6, 2) for z in (-2, 0, 2)], float)
     free = [*around, (0, 0.1, 0), (0, STEP[0] + 0.1, 2), (HALF - 0.15, 1, 0)]
     full = [(0, -0.05, 0), (0, STEP[0] - 0.07, 2), (HALF + 0.07, 1, 0), (-HALF - 0.07, 1, 0), (0, HIGH + 0.07, -1)]
@@ -61,7 +64,7 @@ def test_a_room_is_solid_at_its_walls_floor_and_step_alone():
 
 def test_nobody_walks_where_photos_show_a_small_thing(capsys):
     small = Similarity(np.eye(3), 0.5, np.zeros(3))  # 3 metres wide
-    assert solid_of(moved_splats(room(), small), cameras(unit=0.5), pipeline()) is None
+    assert make_solid(move_splats(room(), small), cameras(unit=0.5), pipeline()) is None
     said = capsys.readouterr().out
     assert re.search(
         r"the photos show 3\.\d x 3\.\d metres, too small to walk in; guests can walk in 5 x 5 or more", said
@@ -69,7 +72,7 @@ def test_nobody_walks_where_photos_show_a_small_thing(capsys):
 
 
 def test_cameras_of_an_unknown_unit_stand_at_the_height_of_eyes():
-    hundreds = moved_splats(room(), Similarity(np.eye(3), 0.01, np.zeros(3)))
-    assert metres_of(hundreds, cameras(unit=0.01)) == pytest.approx(100, rel=0.05)
+    hundreds = move_splats(room(), Similarity(np.eye(3), 0.01, np.zeros(3)))
+    assert measure_metre(hundreds, cameras(unit=0.01)) == pytest.approx(100, rel=0.05)
     with pytest.raises(UserError, match="--walk needs photos that look at a floor"):
-        metres_of(room(), cameras(height=-1.5))
+        measure_metre(room(), cameras(height=-1.5))

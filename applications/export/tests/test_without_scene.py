@@ -17,7 +17,7 @@ from applications.export.formats import FORMATS
 from applications.export.reading import read_any
 from applications.viewer.views import SceneCameras
 from gaussian_renderer import render
-from gaussian_renderer.camera_paths.without_scene import COUNT, circle, have_moved, recorded_cameras
+from gaussian_renderer.camera_paths.without_scene import COUNT, circle_cameras, have_moved, recorded_cameras
 from scene.saved_model import read_model
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of
@@ -28,19 +28,19 @@ from utils.system_utils import UserError
 def test_all_views_of_the_circle_show_the_model():
     splats = balls()
     gaussians = model_of(splats)
-    for camera in circle(splats.means):
+    for camera in circle_cameras(splats.means):
         image = render(camera, gaussians, pipeline(), torch.zeros(3))["render"].detach()
         shown = (image.sum(0) > 0.1).double()
         rows, columns = shown.nonzero().double().mean(0).tolist()
         assert 0.02 < shown.mean() < 0.75
         assert abs(rows / camera.image_height - 0.5) < 0.15 and abs(columns / camera.image_width - 0.5) < 0.15
-    empty = circle(np.zeros((0, 3), np.float32))
+    empty = circle_cameras(np.zeros((0, 3), np.float32))
     assert len(empty) == COUNT and np.isfinite(empty[0].T).all()
 
 
 def test_recorded_poses_are_those_of_the_record(tmp_path):
     record = tmp_path / "cameras.json"
-    cameras = circle(balls().means)
+    cameras = circle_cameras(balls().means)
     for camera in cameras:
         camera.width, camera.height = camera.image_width, camera.image_height
     record.write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(cameras)]))
@@ -54,17 +54,17 @@ def test_recorded_poses_are_those_of_the_record(tmp_path):
 
 def test_a_viewer_begins_at_the_circle(tmp_path):
     path, options = written(tmp_path, ".splat", balls()), pipeline()
-    scene = view.of_file(str(path), options)
+    scene = view.load_file(str(path), options)
     assert scene.loaded_iter == path.name and len(scene.gaussians) == len(balls())
     shown = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
     assert len(shown.by_name) == COUNT and np.allclose(shown.up, [0, -1, 0], atol=1e-6)
     antialiased = written(tmp_path, ".ply", balls().__class__(**(vars(balls()) | {"antialiasing": True})))
-    view.of_file(str(antialiased), options)
+    view.load_file(str(antialiased), options)
     assert options.antialiasing
 
 
 def test_poses_that_moved_since_the_training_are_told(tmp_path):
-    record, cameras = tmp_path / "cameras.json", circle(balls().means)
+    record, cameras = tmp_path / "cameras.json", circle_cameras(balls().means)
     for camera in cameras:
         camera.width, camera.height = camera.image_width, camera.image_height
     assert not have_moved(tmp_path, cameras)  # as there is none
@@ -90,7 +90,7 @@ def gone(tmp_path) -> Path:
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
     written(tmp_path, ".ply", splats).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
     (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=1, source_path='{tmp_path}/gone', white_background=False)")
-    cameras = circle(splats.means)
+    cameras = circle_cameras(splats.means)
     for camera in cameras:
         camera.width, camera.height = camera.image_width, camera.image_height
     (tmp_path / "cameras.json").write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(cameras)]))
@@ -99,12 +99,12 @@ def gone(tmp_path) -> Path:
 
 def test_a_folder_whose_scene_is_gone_keeps_its_poses(gone, capsys):
     options = argparse.Namespace(model_path=str(gone), source_path=str(gone / "gone"), resolution=4)
-    scene = view.of_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
+    scene = view.load_folder(options, argparse.Namespace(iteration=-1, typed_sh_degree=None))
     assert scene.loaded_iter == 7 and len(scene.gaussians) == len(balls())
     assert {(camera.image_width, camera.image_height) for camera in scene.getTrainCameras()} == {(240, 180)}
     assert "gone is gone, so there are poses, but no photos" in capsys.readouterr().err
     with pytest.raises(UserError, match="gone, which is gone; leave it out"):
-        view.kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
+        view.find_kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
 def test_every_format_of_a_folder_whose_scene_is_gone(gone, monkeypatch, capsys):

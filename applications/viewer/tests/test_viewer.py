@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 from synthetic import options_of
 
 from applications.viewer import legend, path_tab, views
-from applications.viewer.coverage import Coverage, Covered
-from applications.viewer.divider import share_at
-from applications.viewer.frames import LONGEST, Frame, Frames, inside, shown_part
+from applications.viewer.coverage import Coverage, PointCoverage
+from applications.viewer.divider import find_share
+from applications.viewer.frames import LONGEST, Frame, Frames, find_inside, select_shown
 from applications.viewer.page import write_crop
 from applications.viewer.path_tab import PathTab
 from applications.viewer.tabs import FileName
-from applications.viewer.untrained import _spheres
-from applications.viewer.views import Pose, SceneCameras, Settings, canvas, fov_of_canvas, pose_of
+from applications.viewer.untrained import _make_spheres
+from applications.viewer.views import Pose, SceneCameras, Settings, fit_canvas, fit_fov, read_pose
 from applications.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from gaussian_renderer import render
 from gaussian_renderer.blending import blend_depth
@@ -72,7 +72,7 @@ def rendered(gaussians, view=None, scaling=1.0, background=BLACK, **options) -> 
 
 def at(camera, width=300, height=100) -> Pose:
     wxyz = Rotation.from_matrix(camera.R).as_quat(scalar_first=True)
-    fov = fov_of_canvas(camera, width / height)
+    fov = fit_fov(camera, width / height)
     return Pose(tuple(camera_center(camera.R, camera.T)), tuple(wxyz), fov, width, height)
 
 
@@ -110,20 +110,22 @@ def test_a_scale_names_the_depths_and_counts_of_its_colours(gaussians):
     distances = torch.linspace(2.0, 40.0, 2000).reshape(1, 20, 100)
     alpha = torch.full_like(distances, 0.8)
     alpha[0, 0, 0] = 0.4  # too thin to have a depth
-    colours, scale = legend.depth_colors(alpha / distances, alpha)
+    colours, scale = legend.color_depth(alpha / distances, alpha)
     assert not colours[:, 0, 0].any() and list(scale.numbers) == sorted(scale.numbers, reverse=True)
     assert scale.numbers[0] == pytest.approx(float(torch.quantile(distances, 0.98)), rel=0.01)
     for number, stop in zip(scale.numbers, legend._STOPS, strict=True):
         y, x = divmod(int((distances[0] - number).abs().argmin()), 100)
         np.testing.assert_allclose(colours[:, y, x], stop, atol=0.01)
     counts = torch.tensor([[0, 10, 20, 30, 40]])
-    colours, scale = legend.count_colors(counts)
+    colours, scale = legend.color_counts(counts)
     assert scale.numbers == (0, 10, 20, 30, 40)
     np.testing.assert_allclose(colours[:, 0].T, legend._STOPS, atol=1e-6)
-    assert "<span>40</span>" in scale.html() and "<span>1,100</span>" in scale._replace(numbers=(1100.0,)).html()
+    assert (
+        "<span>40</span>" in scale.make_html() and "<span>1,100</span>" in scale._replace(numbers=(1100.0,)).make_html()
+    )
     for mode in (views.DEPTH, views.COUNT):
         assert len(frame(gaussians, mode=mode).legend.numbers) == 5
-    assert frame(gaussians).legend.html() == frame(gaussians, mode=views.OPACITY).legend.html() == ""
+    assert frame(gaussians).legend.make_html() == frame(gaussians, mode=views.OPACITY).legend.make_html() == ""
 
 
 def test_a_frame_that_lacks_its_photo_says_so(gaussians, scene_cameras):
@@ -136,13 +138,13 @@ def test_a_frame_that_lacks_its_photo_says_so(gaussians, scene_cameras):
     ):
         there = frame(gaussians, at(camera), scene_cameras, camera=name, **settings).legend
         away = frame(gaussians, FRONT, scene_cameras, camera=name, **settings).legend
-        assert not there.warning and "No photo was taken from here" in away.html() and not away.sides
+        assert not there.warning and "No photo was taken from here" in away.make_html() and not away.sides
         shown = {views.ERROR: "error", views.DEPTH: "depth"}.get(settings.get("mode"), "render")
         said = {"Slider": f"Photo left of the line, {shown} right", "Side by side": f"From the left: photo, {shown}"}
         assert there.sides == said.get(settings.get("comparison"), "")
         assert away.numbers == () or settings["mode"] == views.DEPTH
     assert frame(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).legend.numbers[-1] == 51
-    assert not frame(gaussians, FRONT, scene_cameras, camera=name).legend.html()
+    assert not frame(gaussians, FRONT, scene_cameras, camera=name).legend.make_html()
 
 
 def test_the_crop_box_leaves_gaussians_out_and_the_model_alone(gaussians):
@@ -162,11 +164,11 @@ def test_what_cleaning_leaves_and_what_it_takes_are_drawn_apart(gaussians):
     box = (-1.0, -0.2, -1.0), (1.0, 1.0, 0.0)
     for cleaning, part in ((views.STAYS, kept), (views.GOES, ~kept)):
         chosen = replace(PLAIN, cleaning=cleaning)
-        assert torch.equal(shown_part(gaussians, chosen, kept).get_xyz, gaussians.get_xyz[part])
-        both = shown_part(gaussians, replace(chosen, crop=box), kept).get_xyz
-        assert torch.equal(both, gaussians.get_xyz[part & inside(gaussians.get_xyz, *box)])
-        assert shown_part(gaussians, chosen) is gaussians  # nobody has cleaned
-    assert shown_part(gaussians, PLAIN, kept) is gaussians
+        assert torch.equal(select_shown(gaussians, chosen, kept).get_xyz, gaussians.get_xyz[part])
+        both = select_shown(gaussians, replace(chosen, crop=box), kept).get_xyz
+        assert torch.equal(both, gaussians.get_xyz[part & find_inside(gaussians.get_xyz, *box)])
+        assert select_shown(gaussians, chosen) is gaussians  # nobody has cleaned
+    assert select_shown(gaussians, PLAIN, kept) is gaussians
 
 
 def _ahead(camera, x: float, y: float, z: float) -> torch.Tensor:
@@ -178,20 +180,22 @@ def _ahead(camera, x: float, y: float, z: float) -> torch.Tensor:
 def test_what_a_training_view_showed_from_there_is_covered(scene_cameras):
     camera = next(iter(scene_cameras.by_name.values()))
     places = [(0, 0, 2), (0.98, -0.98, 3), (1.4, 0, 3), (0, -1.4, 3), (0, 0, -2)]
-    covered = Covered(torch.stack([_ahead(camera, *place) for place in places]), [camera]).at(camera.camera_center)
+    covered = PointCoverage(torch.stack([_ahead(camera, *place) for place in places]), [camera]).measure(
+        camera.camera_center
+    )
     torch.testing.assert_close(covered, torch.tensor([1.0, 1, 0, 0, 0]), atol=1e-4, rtol=0)
     middle = _ahead(camera, 0, 0, 3)
     for degrees, share in ((20, 1.0), (38, 0.55), (55, 0.0), (180, 0.0)):
         turn = torch.tensor(Rotation.from_rotvec(np.radians(degrees) * np.asarray(camera.R)[:, 1]).as_matrix()).float()
         eye = middle + turn @ (camera.camera_center - middle)
-        assert float(Covered(middle[None], [camera]).at(eye)) == pytest.approx(share, abs=0.05), degrees
+        assert float(PointCoverage(middle[None], [camera]).measure(eye)) == pytest.approx(share, abs=0.05), degrees
     some = torch.stack([_ahead(camera, x, 0, 3) for x in (0.0, 0.5, 3, -3)])
     guesses = Coverage([camera], scene_cameras.size).guesses(some, camera.camera_center)[:, 0]
     torch.testing.assert_close(guesses, torch.tensor([0.0, 0, 1, 1]), atol=0.02, rtol=0)
 
 
 def test_the_surface_along_a_ray_is_found_where_there_is_one():
-    gaussians = model_of(_spheres(np.float32([[0.5, -0.2, 0]]), np.ones((1, 3), np.float32), 0.05))
+    gaussians = model_of(_make_spheres(np.float32([[0.5, -0.2, 0]]), np.ones((1, 3), np.float32), 0.05))
     frames = Frames(gaussians, SceneCameras([], []), pipeline(), False)
     ray = np.array([0.5, -0.2, 4]) / np.linalg.norm([0.5, -0.2, 4])
     np.testing.assert_allclose(frames.surface(PLAIN, FRONT, ray), [0.5, -0.2, 0], atol=1e-3)
@@ -201,7 +205,7 @@ def test_the_surface_along_a_ray_is_found_where_there_is_one():
 def test_the_surface_of_a_large_gaussian_is_found_far_from_its_mean():
     ray = np.array([0.0, 0, 1])
     mean = np.float32([[4 * np.tan(np.radians(10)), 0, 0]])
-    gaussians = model_of(_spheres(mean, np.ones((1, 3), np.float32), 1.0))
+    gaussians = model_of(_make_spheres(mean, np.ones((1, 3), np.float32), 1.0))
     np.testing.assert_allclose(Frames(gaussians, SceneCameras([], []), pipeline(), False).surface(PLAIN, FRONT, ray), 0)
     beside = free_view(17, 17, np.radians(10), FRONT.position, FRONT.wxyz, "cpu")  # its mean is not in this view
     assert float(surface_of(beside, gaussians, pipeline()).depth[8, 8]) == pytest.approx(4)
@@ -228,14 +232,14 @@ def test_guesses_are_dark_and_photos_are_not(gaussians, scene_cameras):
 def test_left_of_the_slider_is_the_scenes_image_and_right_of_it_the_render(gaussians, scene_cameras, size):
     name, camera = next(iter(scene_cameras.by_name.items()))
     shown = drawn(gaussians, at(camera, *size), scene_cameras, camera=name, comparison=views.SLIDER, slider=0.25)
-    wide, high = canvas(96, 64, size[0] / size[1])
+    wide, high = fit_canvas(96, 64, size[0] / size[1])
     top, left = (high - 64) // 2, (wide - 96) // 2
     assert shown.shape == (high, wide, 3)
     inner = shown[top : top + 64, left : left + 96]
     np.testing.assert_array_equal(inner[:, :24], camera.target(BLACK).permute(1, 2, 0).numpy()[:, :24])
     np.testing.assert_array_equal(inner[:, 24:], rendered(gaussians, camera)[:, 24:])
-    assert share_at((left + 24) / wide, camera, wide, high) == pytest.approx(0.25)
-    assert share_at(-0.1, camera, *size) == 0 and share_at(1.0, camera, *size) == 1
+    assert find_share((left + 24) / wide, camera, wide, high) == pytest.approx(0.25)
+    assert find_share(-0.1, camera, *size) == 0 and find_share(1.0, camera, *size) == 1
 
 
 def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
@@ -246,7 +250,7 @@ def test_side_by_side_are_image_render_and_error(gaussians, scene_cameras):
     assert abs(error - np.minimum(abs(target - image) * 5, 255)).max() <= 4  # rounded before the difference
     for mode, sides in ((views.COLOUR, "photo, render, error"), (views.DEPTH, "photo, depth")):
         words = frame(gaussians, at(camera), scene_cameras, camera=name, comparison=views.BESIDE, mode=mode).legend
-        assert f"left: {sides}</div>" in words.html()
+        assert f"left: {sides}</div>" in words.make_html()
         assert words.numbers[-1] == 51 if mode == views.COLOUR else words.numbers != legend.ERROR_SCALE.numbers
     alone = drawn(gaussians, at(camera), scene_cameras, camera=name, mode=views.ERROR).astype(int)
     assert abs(alone[:64, (alone.shape[1] - 96) // 2 :][:, :96] - error).max() <= 1
@@ -299,10 +303,10 @@ def test_frames_take_no_more_than_their_share_of_the_time(share, cost):
     end = clock.now + 60
     while clock.now < end:
         clock.now += step
-        if budget.allows(share):
+        if budget.allows_frame(share):
             began = clock.now
             clock.now += cost
-            budget.spent(began, cost)
+            budget.note_frame(began, cost)
             spent, count = spent + cost, count + 1
     assert spent <= share * 60 + cost
     assert count <= 30 * 60 + 1
@@ -313,21 +317,21 @@ def test_a_browser_that_moves_gets_coarse_frames_and_then_a_sharp_one():
     clock = SimpleNamespace(now=100.0)
     watchers = Watchers(lambda: clock.now)
     assert not watchers.any and watchers.next() is None
-    watchers.moved(7, FRONT)
+    watchers.update_browser(7, FRONT)
     first = watchers.next()
     assert watchers.any and first.urgent and not first.coarse
-    watchers.moved(7, replace(FRONT, fov=0.9))
-    watchers.drew(first)
+    watchers.update_browser(7, replace(FRONT, fov=0.9))
+    watchers.note_drawing(first)
     assert watchers.next().pose.fov == 0.9  # it moved while the frame was drawn
     clock.now += 1
-    watchers.moved(7, replace(FRONT, fov=0.7))
+    watchers.update_browser(7, replace(FRONT, fov=0.7))
     for wait, coarse in ((0, True), (STILL_AFTER + 0.01, False)):
         clock.now += wait
         wish = watchers.next()
         assert wish.coarse == coarse and wish.urgent and wish.pose.fov == 0.7
-        watchers.drew(wish)
+        watchers.note_drawing(wish)
         assert watchers.next() is None
-    watchers.left(7)
+    watchers.remove_browser(7)
     assert not watchers.any
 
 
@@ -335,31 +339,31 @@ def test_a_model_that_changes_is_shown_to_all_who_look_and_nobody_waits_for_it()
     clock = SimpleNamespace(now=100.0)
     watchers = Watchers(lambda: clock.now)
     for client in (1, 2):
-        watchers.moved(client, FRONT)
-        watchers.drew(watchers.next(5), 5)
+        watchers.update_browser(client, FRONT)
+        watchers.note_drawing(watchers.next(5), 5)
         clock.now += 1
     assert watchers.next(5) is None
     wish = watchers.next(6)
     assert wish.client == 1 and not wish.urgent and not wish.coarse
-    watchers.drew(wish, 6)
+    watchers.note_drawing(wish, 6)
     assert watchers.next(6).client == 2
-    watchers.moved(1, replace(FRONT, fov=0.1))
+    watchers.update_browser(1, replace(FRONT, fov=0.1))
     assert watchers.next(6).client == 1  # who waits comes first
-    watchers.drew(watchers.next(6), 6)
-    watchers.changed()
+    watchers.note_drawing(watchers.next(6), 6)
+    watchers.note_change()
     assert watchers.next(6).urgent
 
 
 def test_what_a_browser_sends_is_checked():
     sound = {"position": [1, 2, 3], "wxyz": [2, 0, 0, 0], "fov": 1.0, "image_width": 800, "image_height": 600}
-    pose = pose_of(SimpleNamespace(**sound))
+    pose = read_pose(SimpleNamespace(**sound))
     assert pose == Pose((1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), 1.0, 800, 600)
     for wrong in (
         {"wxyz": [0, 0, 0, 0]}, {"wxyz": [1e18, 0, 0, 0]}, {"fov": 0.0}, {"fov": math.pi}, {"fov": -1.0},
     ):  # fmt: skip
-        assert pose_of(SimpleNamespace(**sound | wrong)) is None, wrong
+        assert read_pose(SimpleNamespace(**sound | wrong)) is None, wrong
     for width, height in ((10**9, 10**9), (10**9, 1), (0, 0), (-5, 10**6)):
-        pose = pose_of(SimpleNamespace(**sound | {"image_width": width, "image_height": height}))
+        pose = read_pose(SimpleNamespace(**sound | {"image_width": width, "image_height": height}))
         assert 1 <= pose.width <= 8192 and 1 <= pose.height <= 8192
         assert 0.09 < pose.width / pose.height < 11
 
@@ -425,7 +429,7 @@ def test_a_recorded_path_is_read_by_what_renders_it(recorded, tmp_path):
 
 
 def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch):
-    for call in (recorded.go, recorded.delete, recorded.open):
+    for call in (recorded.move_to_keyframe, recorded.delete, recorded.open):
         with pytest.raises(UserError, match="no keyframe is chosen|no such path"):
             call(_client())
     for x in (1.0, 2.0, 3.0, 4.0):
@@ -433,7 +437,7 @@ def test_keyframes_are_listed_gone_to_and_deleted_anywhere(recorded, monkeypatch
     assert recorded.chosen.options == ("1: at 0 s", "2: at 2 s", "3: at 4 s", "4: at 6 s")
     assert recorded.chosen.value == "4: at 6 s"
     recorded.chosen.value = "2: at 2 s"
-    recorded.go(client := _client(fov=0.3))
+    recorded.move_to_keyframe(client := _client(fov=0.3))
     assert client.camera.position.tolist() == [2.0, 0.0, 0.0] and math.isclose(client.camera.fov, 1.0)
     assert client.camera.look_at[2] < 0 and client.camera.up_direction[1] > 0  # wxyz is half a turn about x
     for chosen, options, places in (
@@ -465,7 +469,7 @@ def test_no_name_leads_out_of_the_folder(server, tmp_path, name):
 def test_a_crop_is_written_as_any_program_reads_it(gaussians, tmp_path):
     gaussians.active_sh_degree, gaussians.world_offset = 1, (10.0, 20.0, 30.0)
     box = (0.5, 0.4, 0.3), (-0.5, -0.4, -2.0)
-    keep = inside(gaussians.get_xyz, *box)
+    keep = find_inside(gaussians.get_xyz, *box)
     assert 0 < write_crop(tmp_path / "a/crop.ply", gaussians, box, antialiasing=True) == keep.sum() < 200
     splats = read_splats(tmp_path / "a/crop.ply")
     np.testing.assert_array_equal(splats.means, gaussians.get_xyz[keep].detach())

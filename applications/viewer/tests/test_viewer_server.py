@@ -24,11 +24,11 @@ from applications.viewer import server as servers  # noqa: E402
 from applications.viewer import watchers  # noqa: E402
 from applications.viewer.measure_tab import Place  # noqa: E402
 from applications.viewer.page import Page, answer  # noqa: E402
-from applications.viewer.tabs import first_box  # noqa: E402
-from applications.viewer.untrained import _spheres  # noqa: E402
+from applications.viewer.tabs import find_first_box  # noqa: E402
+from applications.viewer.untrained import _make_spheres  # noqa: E402
 from applications.viewer.views import Settings  # noqa: E402
 from gaussian_renderer.camera_paths.start import LEAST, MOST  # noqa: E402
-from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle  # noqa: E402
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle_cameras  # noqa: E402
 from groundwork.files.similarity import Similarity, read_orientation, recorded_similarity  # noqa: E402
 from scene import Scene  # noqa: E402
 from scene.with_splats import model_of  # noqa: E402
@@ -249,11 +249,11 @@ def test_reset_gives_the_view_its_first_values(page):
         client.look()
         _set(client, _button(page, "Reset"), True)
         wait_for(lambda: view.read() == first and not view.crop_file.field.visible and view.reset.disabled)
-    assert view.corners() == first_box(page._gaussians.get_xyz)
+    assert view.corners() == find_first_box(page._gaussians.get_xyz)
 
 
 def test_without_photos_nothing_is_compared_with_them(tmp_path):
-    cameras = circle(np.float32([[0, 0, 0], [1, 1, 1]]))
+    cameras = circle_cameras(np.float32([[0, 0, 0], [1, 1, 1]]))
     shown = Page(ANY, WithoutScene(model(5), str(tmp_path), "a.ply", cameras), pipeline(), False, False)
     assert shown.images.comparison.disabled and "Error" not in shown.view.mode.options
     shown.stop()
@@ -369,9 +369,9 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
     (tmp_path / "scene").mkdir()
     (tmp_path / "out").mkdir()
     (tmp_path / "out/model.json").write_text("{}")
-    gaussians = model_of(_spheres(places, np.ones((4, 3), np.float32), 0.05))
+    gaussians = model_of(_make_spheres(places, np.ones((4, 3), np.float32), 0.05))
     gaussians.world_offset = (10.0, 0.0, 0.0)
-    shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle(places))
+    shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle_cameras(places))
     page = Page(ANY, shown, pipeline(), False, False, oriented=str(tmp_path / "scene"))
     tab = page.measure
     with Client(page.url) as client:
@@ -420,9 +420,9 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
         assert client.until("NotificationShowMessage")["props"]["title"] == "As before"
     page.stop()
     assert recorded_similarity(str(tmp_path / "out"), "")["similarity"] == record
-    found = Similarity.of(record, "here").from_local(np.array([10.0, 0, 0]))
+    found = Similarity.read(record, "here").from_local(np.array([10.0, 0, 0]))
     assert found.metric and found.scale == pytest.approx(2.5, rel=1e-2)
-    moved = found.points(places)
+    moved = found.transform(places)
     np.testing.assert_allclose(moved[:3, 1], 0, atol=0.03)
     assert moved[3, 1] == pytest.approx(-2.5, abs=0.05)  # above
     assert moved[1, 0] > moved[2, 0] and moved[1, 2] == pytest.approx(moved[2, 2], abs=0.03)  # the front is along x

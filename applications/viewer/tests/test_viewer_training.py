@@ -108,7 +108,7 @@ def test_watching_changes_no_byte_of_the_model(colmap_scene, tmp_path, monkeypat
     expected = _train(colmap_scene, tmp_path / "alone", viewer=False).read_bytes()
 
     def connect(watched: Watched) -> None:
-        watched.observer.budget.allows = lambda share: True  # so that each mode gets its frames, however slow they are
+        watched.observer.budget.allows_frame = lambda share: True  # each mode gets its frames, however slow they are
         watched.connect()
 
     def look_at(mode: str, **more: object) -> Callable[[Watched], None]:

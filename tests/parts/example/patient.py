@@ -32,7 +32,7 @@ class Patient(Adc):
         self._patience = run.opt.patience
         self._model = model = run.gaussians
         # Columns move with their rows; new rows have zeros. `own`: of several processes, each keeps its part.
-        started = torch.zeros(len(model), dtype=torch.int32) if state is None else model.shards.own(state)
+        started = torch.zeros(len(model), dtype=torch.int32) if state is None else model.shards.own_rows(state)
         model.columns[self.name] = started.to(model.get_xyz.device)
 
     def densify(self, iteration: int, limit_size: bool) -> None:
@@ -47,4 +47,4 @@ class Patient(Adc):
         super().densify(iteration, limit_size)
 
     def state(self) -> Any:
-        return self._model.shards.whole(self._model.columns[self.name])
+        return self._model.shards.gather_whole(self._model.columns[self.name])

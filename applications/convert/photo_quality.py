@@ -1,4 +1,4 @@
-"""Blur and brightness of the photos of a capture, which applications/convert/findings.py judges.
+"""Blur and brightness of the photos of a capture, which applications/convert/checks.py judges.
 
 capture.json, which worker.py writes of the chosen model: of each placed photo by name its place, view and up directions
 (3,), its number of points, and the points that it shares with others; and some points with their colours.
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from applications.convert.findings import SHARED, Look
+from applications.convert.checks import SHARED, Look
 from applications.convert.layout import Layout
 from groundwork.host.progress import in_threads
 from scene.checks.photo_files import sharpness, small
@@ -18,28 +18,28 @@ from scene.images.exposures import exposures
 from scene.readers.colmap import read_model
 
 
-def looks_of(folder: Path, names: Sequence[str]) -> dict[str, Look]:
-    """Sharpness and brightness of photos in a folder, by name."""
-    found = in_threads(lambda name: _look(folder / name), names, desc="Looking at photos")
+def measure_looks(folder: Path, names: Sequence[str]) -> dict[str, Look]:
+    """Measure the sharpness and the brightness of photos in a folder; return them by name."""
+    found = in_threads(lambda name: _measure_look(folder / name), names, desc="Looking at photos")
     return dict(zip(names, found, strict=True))
 
 
-def _look(path: Path) -> Look:
+def _measure_look(path: Path) -> Look:
     pixels = small(path)
     light = (pixels.astype(np.float32).mean() / 255) ** 2.2  # about the inverse of sRGB's curve
     return Look(sharpness(pixels), math.log2(max(float(light), 1e-4)))
 
 
-def compared(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
-    """Looks of photos, with the brightness of the placed ones by the points that they share with others.
+def compare_brightness(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
+    """Replace the brightness of placed photos by that of the points which they share with other photos.
 
-    A photo of a dark wall is of no other exposure. One that shares few points has an unknown brightness, NaN.
+    So a photo of a dark wall does not count as underexposed. A photo that shares few points has brightness NaN.
     """
     model = read_model(layout.sparse / "0", with_2d_points=True)
     images = [image for image in model.images if image.name in looks]
     sizes = [(model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) for image in images]
     seen = in_threads(
-        lambda image, size: _at_points(layout.images / image.name, image.xys / size, image.point3D_ids),
+        lambda image, size: _colors_at_points(layout.images / image.name, image.xys / size, image.point3D_ids),
         images, sizes, desc="Comparing photos",
     )  # fmt: skip
     enough = [number for number, (points, _) in enumerate(seen) if len(points) >= SHARED]
@@ -53,10 +53,11 @@ def compared(looks: Mapping[str, Look], layout: Layout) -> dict[str, Look]:
     return {**looks, **found}
 
 
-def _at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of the points (K,) that a photo shows their numbers and colours (K,3).
+def _colors_at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the numbers (K,) of the points that a photo shows, and their colours (K, 3) in [0, 1].
 
-    places: (K,2), in parts of the photo's width and height. numbers: negative where there is no point.
+    places: (P, 2), parts of the photo's width and height.
+    numbers: (P,) of points, negative where there is none.
     """
     pixels = small(path)
     size = pixels.shape[1::-1]

@@ -10,14 +10,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from groundwork.files.json_files import read_json
-from groundwork.files.ours import digest_of, files_of, is_ours
+from groundwork.files.ours import folder_digest, is_ours, sorted_files
 from utils.system_utils import atomic_write, mkdir_p
 
 PLACE = "{folder}"  # stands for the name of the folder
 
 
 @contextlib.contextmanager
-def with_folder(path: Path, prefix: str) -> Iterator[Path]:
+def write_with_folder(path: Path, prefix: str) -> Iterator[Path]:
     """Yield a folder for files; afterwards the JSON file `path` beside it names them where they then are.
 
     The block puts the JSON file into the folder, too, under the name of `path`, with PLACE for the folder's name, which
@@ -25,7 +25,7 @@ def with_folder(path: Path, prefix: str) -> Iterator[Path]:
     is such a folder already, files that lack or differ are replaced. An earlier JSON file of ours stays valid until the
     new one takes its place; then its folder goes, if it is as we wrote it, and no other JSON file beside it names it.
     """
-    earlier = _folder_of(path)
+    earlier = _find_folder(path)
     with contextlib.ExitStack() as stack:
         temporary = stack.enter_context(atomic_write(path))
         holder = tempfile.TemporaryDirectory(prefix=".tiles.", suffix=".tmp", dir=path.parent)
@@ -34,26 +34,26 @@ def with_folder(path: Path, prefix: str) -> Iterator[Path]:
         yield folder
         text = (folder / path.name).read_text(encoding="utf-8")
         (folder / path.name).unlink()
-        final = path.parent / (prefix + digest_of(folder, path.name))
+        final = path.parent / (prefix + folder_digest(folder, path.name))
         temporary.write_text(text.replace(PLACE, final.name), encoding="utf-8")
-        _put(folder, final)
+        _put_folder(folder, final)
     if earlier and earlier != final:
-        _remove(earlier, path)
+        _remove_folder(earlier, path)
 
 
-def _put(folder: Path, final: Path) -> None:
+def _put_folder(folder: Path, final: Path) -> None:
     """Rename a folder; or bring its files into one that is there, of which some may be damaged."""
     if not final.exists():
         os.replace(folder, final)
         return
-    for file in files_of(folder):
+    for file in sorted_files(folder):
         target = final / file.relative_to(folder)
         if not (target.is_file() and filecmp.cmp(file, target, shallow=False)):
             mkdir_p(target.parent)
             os.replace(file, target)
 
 
-def _folder_of(path: Path) -> Path | None:
+def _find_folder(path: Path) -> Path | None:
     """The folder that an earlier file names; None without one."""
     try:
         name = read_json(path)["asset"]["extras"]["folder"]
@@ -63,7 +63,7 @@ def _folder_of(path: Path) -> Path | None:
     return path.parent / name if there else None
 
 
-def _remove(folder: Path, path: Path) -> None:
+def _remove_folder(folder: Path, path: Path) -> None:
     """Remove the folder of an earlier `path`; say so if it stays."""
     others = (file for file in path.parent.iterdir() if file.suffix.lower() == ".json" and file.is_file())
     if not is_ours(folder, path.name):

@@ -1,10 +1,12 @@
-"""A capture and its conversion: photos left out, poses that contradict their matches, what to photograph again.
+"""Checks of a capture and its conversion: photos left out, poses that contradict their matches, photos to take again.
 
-For convert.py's report, and for those that read it: train.py and doctor.py.
+convert.py's report has their results, which train.py and doctor.py read.
 """
 
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import groupby
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -36,6 +38,7 @@ SHARED = 30  # points that a photo shares with another one that is near
 FEW = 2  # such neighbours, with which a photo is weakly connected
 _MANY = 0.05  # share of a camera's photos: a few may be wrong for other reasons
 _FEWEST = 3
+_MOST_GAPS = 3
 _EXPOSURES = "--appearance ppisp"  # of train.py, for photos that differ by more
 _BY_HAND = "--cameras per_photo, or put the photos of each lens into a sub-folder and use --cameras per_folder"
 _OVERLAPPING = "each overlapping the one before by 60 to 80 %"
@@ -48,7 +51,7 @@ class Look(NamedTuple):
     brightness: float
 
 
-def refuse_nothing(models: "Sequence[Model]", images: Sequence[str], partners: dict[str, int], matcher: str) -> None:
+def refuse_unplaced(models: "Sequence[Model]", images: Sequence[str], partners: dict[str, int], matcher: str) -> None:
     """Raise UserError with the likeliest reason if no model has a registered photo."""
     if models and models[0].registered:
         return
@@ -63,7 +66,7 @@ def refuse_nothing(models: "Sequence[Model]", images: Sequence[str], partners: d
     raise UserError(f"none of {len(images)} photos could be placed: {reason}; {remedy}")
 
 
-def of_model(
+def check_reconstruction(
     models: "Sequence[Model]",
     images: Sequence[str],
     partners: dict[str, int],
@@ -73,17 +76,21 @@ def of_model(
     more_points: int = 0,
     mode: str = "",
 ) -> Iterator[Finding]:
-    """Weaknesses of the chosen model, models[0], that training will show.
+    """Find weaknesses of the chosen model, models[0], that training will show.
 
-    at_limit: --max_num_features if a photo reached it, else 0. tried: the models of mapping.py, the chosen one first.
-    more_points: of dense_points.py. mode: --cameras.
+    images: names of all photos.
+    partners: number of matching photos of each photo.
+    at_limit: --max_num_features if a photo reached it, else 0.
+    tried: the models of mapping.py, the chosen one first.
+    more_points: number of points that dense_points.py has added.
+    mode: --cameras.
     """
     chosen = models[0]
     against = list(tried[0].get("against", ())) if tried else []
     out = sorted(set(images) - set(chosen.registered) - set(against))
     if tried:
-        yield from _of_judgement(tried[0], len(images), partners, mode)
-        if only_turned(tried[0]) or is_folded(tried[0]):
+        yield from _check_judgement(tried[0], len(images), partners, mode)
+        if is_only_turned(tried[0]) or is_folded(tried[0]):
             return  # what else is wrong comes of it
     if out:
         lonely = sum(partners.get(name, 0) == 0 for name in out)
@@ -96,7 +103,7 @@ def of_model(
     if others:
         sizes = f"{len(chosen.registered)} photos are used, the other parts have {', '.join(map(str, others))}"
         remedy = "take photos that lead from one part to the next"
-        remedy += _unless(mode, ", or try --cameras per_photo if they came through several lenses")
+        remedy += _unless_per_photo(mode, ", or try --cameras per_photo if they came through several lenses")
         yield Finding(f"the photos form {len(others) + 1} unconnected parts ({sizes})", remedy)
     if (points := chosen.points + more_points) < FEWEST_POINTS:
         remedy = "use larger or more photos" + (f", or --max_num_features {2 * at_limit}" if at_limit else "")
@@ -104,20 +111,26 @@ def of_model(
     if chosen.track_length < SHORT_TRACKS:
         text = f"a point is in {chosen.track_length:.1f} photos on average, so the photos overlap little"
         yield Finding(text, f"take more photos, {_OVERLAPPING}")
-    if _is_large(chosen):
+    if _has_large_error(chosen):
         remedy = "if objects moved, mask them (--mask_path); for a fisheye lens use --camera OPENCV_FISHEYE"
-        remedy += _unless(mode, "; if the photos come from several lenses, try --cameras per_photo")
+        remedy += _unless_per_photo(mode, "; if the photos come from several lenses, try --cameras per_photo")
         yield Finding(f"the mean reprojection error is {chosen.error:.1f} pixels", remedy)
 
 
-def _unless(mode: str, text: str) -> str:
-    """Return a text that advises --cameras per_photo, "" if that is the mode."""
+def _unless_per_photo(mode: str, text: str) -> str:
+    """Return a text that advises --cameras per_photo; "" if that is the mode already."""
     return "" if mode == "per_photo" else text
 
 
-def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, int], mode: str) -> Iterator[Finding]:
-    """Findings of the matches about the chosen model (mapping.py). partners: matching photos of each photo."""
-    if only_turned(found):
+def _check_judgement(
+    found: Mapping[str, Any], photos: int, partners: Mapping[str, int], mode: str
+) -> Iterator[Finding]:
+    """Find weaknesses of the chosen model by the judgement of mapping.py, which compares poses and matches.
+
+    photos: their number.
+    partners: number of matching photos of each photo.
+    """
+    if is_only_turned(found):
         text = "the camera turned in one place, as rotations alone explain the matches, so the depths are not known"
         yield Finding(text, "walk, do not turn: take each photo some steps from the one before")
         return
@@ -132,13 +145,17 @@ def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, 
         yield Finding(text, "look at capture.html, or take more photos that overlap")
     if is_wrong(found):
         matches = f"{found['contradicting']:.0%} of the matches that they were made from"
-        remedy = _unless(mode, "if photos are of several lenses, zoomed or cropped, use --cameras per_photo; else ")
+        remedy = _unless_per_photo(
+            mode, "if photos are of several lenses, zoomed or cropped, use --cameras per_photo; else "
+        )
         remedy += "remove photos of other things from input, and take more that overlap"
         yield Finding(f"the poses contradict {matches}, so they are probably wrong", remedy)
     lonely = [name for name in found.get("against", ()) if partners.get(name, 0) <= LONELY]
     if against := sorted(set(found.get("against", ())) - set(lonely)):
         text = f"{len(against)} of {photos} photos left out ({some(against)}), since their matches contradict the"
-        remedy = _unless(mode, "if they are of another lens, zoomed or cropped, use --cameras per_photo; else ")
+        remedy = _unless_per_photo(
+            mode, "if they are of another lens, zoomed or cropped, use --cameras per_photo; else "
+        )
         yield Finding(f"{text} others", f"{remedy}remove them from input, and take more there")
     if lonely:
         text = f"{len(lonely)} of {photos} photos left out ({some(lonely)}), since too few others match them"
@@ -146,32 +163,32 @@ def _of_judgement(found: Mapping[str, Any], photos: int, partners: Mapping[str, 
 
 
 def is_wrong(found: Mapping[str, Any]) -> bool:
-    """Tell a judged model that is wrong, although it is the best. One without pairs cannot be judged."""
+    """Tell if a judged model is wrong, although it is the best one; a model without pairs cannot be judged."""
     if not found.get("pairs"):
         return False
     is_split = found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
-    return is_split or only_turned(found) or is_folded(found)
+    return is_split or is_only_turned(found) or is_folded(found)
 
 
 def is_folded(found: Mapping[str, Any]) -> bool:
-    """Tell a judged model that lays parts which look alike upon each other."""
+    """Tell if a judged model lays parts which look alike upon each other."""
     return len(found.get("alike", ())) > ALIKE * found.get("photos", 0)
 
 
-def only_turned(found: Mapping[str, Any]) -> bool:
-    """Tell a judged model of a camera that stood in one place."""
+def is_only_turned(found: Mapping[str, Any]) -> bool:
+    """Tell if the camera of a judged model stood in one place."""
     error = found.get("rotation")
     return error is not None and error < TURNED
 
 
-def _is_large(model: "Model") -> bool:
-    """Whether the error is that of a weak model, in photos of its size."""
+def _has_large_error(model: "Model") -> bool:
+    """Tell if the reprojection error is larger than that of a good model, in photos of this size."""
     pixels, share = LARGE_ERROR
     return model.error > max([pixels, *(share * max(camera["size"]) for camera in model.cameras)])
 
 
-def of_given_poses(model: "Model", images: Sequence[str]) -> Iterator[Finding]:
-    """Weaknesses of a model at given poses. UserError if the photos contradict the poses."""
+def check_given_poses(model: "Model", images: Sequence[str]) -> Iterator[Finding]:
+    """Find weaknesses of a model at given poses. UserError if the photos contradict the poses."""
     fit = f"{model.points} points, mean error {model.error:.1f} pixels"
     remedy = "check that the poses and lenses are of these photos"
     if model.points < len(model.registered):
@@ -179,21 +196,23 @@ def of_given_poses(model: "Model", images: Sequence[str]) -> Iterator[Finding]:
     if out := sorted(set(images) - set(model.registered)):
         text = f"{len(out)} of {len(images)} photos have no pose in the file and were left out ({some(out)})"
         yield Finding(text, "add their poses, or omit --poses")
-    if model.points < FEWEST_POINTS or _is_large(model):
+    if model.points < FEWEST_POINTS or _has_large_error(model):
         remedies = "; ".join((remedy, *(remedy_of(True) for remedy_of in tools("for_wrong_poses"))))
         yield Finding(f"the photos fit the given poses badly ({fit})", remedies)
 
 
-def of_shared_cameras(
+def check_shared_cameras(
     cameras: Sequence[dict[str, Any]], known: dict[str, Lens], mode: str, frames: Collection[str] = ()
 ) -> Iterator[Finding]:
-    """Cameras whose photos seem to come through several lenses, and missing EXIF data.
+    """Find cameras whose photos seem to come through several lenses, and missing EXIF data.
 
-    known: lenses by EXIF. mode: --cameras. frames: of videos, which never have EXIF data.
+    known: lenses by EXIF.
+    mode: --cameras.
+    frames: names of frames of videos, which never have EXIF data.
     """
     for camera in cameras:
         fits = {name: fit for name, fit in camera["photos"].items() if fit}
-        other = [name for name, fit in fits.items() if _is_other(*fit)]
+        other = [name for name, fit in fits.items() if _has_other_lens(*fit)]
         if len(other) >= max(_FEWEST, _MANY * len(fits)):
             factors = sorted(fits[name][0] for name in other)
             several = len({known.get(name) for name in camera["photos"]}) > 1
@@ -204,44 +223,52 @@ def of_shared_cameras(
                 "convert again with " + ("--cameras per_lens" if several else _BY_HAND),
             )
     photos = [name for name in known if name not in frames]
-    silent = [name for name in photos if not known[name].tells_apart]
+    silent = [name for name in photos if not known[name].is_distinct]
     if mode == "per_lens" and 0 < len(silent) < len(photos):
         text = f"the EXIF data of {len(silent)} of {len(photos)} photos name no lens ({some(silent)}), and those of"
         remedy = f"if they came through several lenses, use {_BY_HAND}"
         yield Finding(f"{text} one size and folder share a camera", remedy)
 
 
-def _is_other(factor: float, error: float, own_error: float) -> bool:
+def _has_other_lens(factor: float, error: float, own_error: float) -> bool:
     return abs(factor - 1) > OTHER_LENS and own_error < BETTER * error
 
 
-def neighbours_of(photos: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
-    """The photos with which each placed photo shares enough points, most first."""
+def find_neighbours(photos: Mapping[str, Mapping[str, Any]]) -> dict[str, list[str]]:
+    """Find for each placed photo the others with which it shares enough points, those with most points first."""
     return {
         name: [other for other, count in sorted(photo["shared"].items(), key=lambda one: -one[1]) if count >= SHARED]
         for name, photo in photos.items()
     }
 
 
-def worth(
+def rate_capture(
     report: Mapping[str, Any], photos: Mapping[str, Mapping[str, Any]], looks: Mapping[str, Look]
 ) -> dict[str, Any]:
-    """What a capture is worth, for convert_report.json.
+    """Rate a capture, for convert_report.json.
 
-    report: the content of that file so far. photos: of capture.json. looks: of all photos, `compared`. Returns
-    `weakly_connected` and `blurred`, names of photos; `brightness_spread_stops`, of the placed ones, which train, or
-    None; and `again`, a line for each thing to photograph again.
+    report: the content of that file so far.
+    photos: of capture.json.
+    looks: of all photos, from `compare_brightness`.
+    Returns `weakly_connected` and `blurred`, names of photos; `brightness_spread_stops` of the placed photos, or None;
+    and `again`, a sentence for each thing to photograph again.
     """
-    neighbours = neighbours_of(photos)
+    neighbours = find_neighbours(photos)
     against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}
     weak = sorted(name for name, others in neighbours.items() if len(others) < min(FEW, len(photos) - 1))
     soft = blurred({name: look.sharpness for name, look in looks.items()})
     bright = [look.brightness for name, look in looks.items() if name in photos and math.isfinite(look.brightness)]
     spread = round(float(np.std(bright)), 3) if bright else None
     if any(SHARED_TEXT in line for line in report.get("advice", ())):  # why photos are left out or weakly connected
-        again = _again([], [], soft, spread)
+        again = _list_retakes([], [], [], soft, spread)
     else:
-        again = _again(sorted(set(report["left_out"]) - against), weak, soft, spread)
+        gaps = find_gaps(report["left_out"], photos)
+        others = [
+            name
+            for name in sorted(set(report["left_out"]) - against)
+            if not any(before < name < after for _, before, after in gaps)
+        ]
+        again = _list_retakes(gaps, others, weak, soft, spread)
     return {
         "weakly_connected": weak,
         "blurred": soft,
@@ -250,49 +277,70 @@ def worth(
     }
 
 
-def _again(left_out: list[str], weak: list[str], soft: list[str], spread: float | None) -> list[str]:
-    lines = []
+def _list_retakes(
+    gaps: list[tuple[int, str, str]], left_out: list[str], weak: list[str], soft: list[str], spread: float | None
+) -> list[str]:
+    lines = [
+        f"Take photos between {before} and {after}: {count} there could not be placed" for count, before, after in gaps
+    ]
     if left_out:
         lines.append(
-            f"what {some(left_out)} show, if it belongs to the scene: take photos on the way from there to the others, "
-            f"{_OVERLAPPING}"
+            f"Take photos on the way from {some(left_out)} to the others, {_OVERLAPPING}: "
+            f"{'this one' if len(left_out) == 1 else 'these'} could not be placed"
         )
     if weak:
-        lines.append(f"around {some(weak)}: fewer than {FEW} other photos share points with each; take more there")
+        lines.append(f"Take more photos around {some(weak)}: fewer than {FEW} other photos share points with each")
     if soft:
-        lines.append(f"{some(soft)}: blurred; hold the camera still, or add light")
+        lines.append(f"Hold the camera still, or add light, for {some(soft)}: blurred")
     if spread and spread > EXPOSURES:
         lines.append(
-            f"with a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
+            f"Use a fixed exposure, if you can: the photos' brightness differs by {spread:.1f} stops; train these "
             f"with {_EXPOSURES}"
         )
     return lines
 
 
-def lines_of(report: Mapping[str, Any]) -> list[str]:
-    """The report of a capture in a few lines, after its summary."""
+def find_gaps(left_out: Collection[str], placed: Collection[str]) -> list[tuple[int, str, str]]:
+    """Find runs of several left-out photos between two placed ones, by name and within a folder.
+
+    Returns the _MOST_GAPS longest runs, longest first: number of photos, and the placed photos before and after.
+    """
+    found = []
+    for _, names in groupby(sorted({*left_out, *placed}), lambda name: PurePosixPath(name).parent):
+        before, count = "", 0
+        for name in names:
+            if name in left_out:
+                count += 1
+                continue
+            if before and count > 1:
+                found.append((count, before, name))
+            before, count = name, 0
+    return sorted(found, key=lambda gap: -gap[0])[:_MOST_GAPS]
+
+
+def describe_capture(report: Mapping[str, Any]) -> list[str]:
+    """Describe overlap, blur and brightness of a capture, and say which photos to take again, a line for each."""
     weak, soft = report["weakly_connected"], report["blurred"]
     lines = []
-    if weak or not unusable(report):
+    if weak or not why_unusable(report):
         few = f"{len(weak)} of {report['registered']} photos weakly connected ({some(weak)})"
         lines.append(f"overlap: {few if weak else 'no photo is weakly connected'}")
     said = f"{len(soft)} of {report['photos']} photos blurred ({some(soft)})"
     lines.append(f"blur: {said if soft else 'no photo is blurred'}")
     if (spread := report["brightness_spread_stops"]) is not None:
         lines.append(f"brightness: the photos differ by {spread:.2f} stops")
-    lines += [f"photograph again {line}" for line in report["again"]]
-    return lines
+    return [*lines, *report["again"]]
 
 
 def training_options(report: Mapping[str, Any]) -> str:
-    """Options of train.py that lines of the report name; "" if there are none."""
+    """Return the options of train.py that lines of the report advise; "" if there are none."""
     return _EXPOSURES if any(_EXPOSURES in line for line in report["again"]) else ""
 
 
-def unusable(report: Mapping[str, Any]) -> str | None:
-    """What to say where too few photos are placed, or where they contradict each other."""
+def why_unusable(report: Mapping[str, Any]) -> str | None:
+    """Return the reason why a scene should not be trained: few photos are placed, or poses are wrong; None: it can."""
     placed, count = report["registered"], report["photos"]
-    if report.get("tried") and only_turned(report["tried"][0]):
+    if report.get("tried") and is_only_turned(report["tried"][0]):
         return "the camera turned in one place, so do not train on this scene; walk, do not turn"
     if report.get("tried") and is_folded(report["tried"][0]):
         return "parts that look alike are laid upon each other in it, so do not train on this scene"
@@ -301,6 +349,6 @@ def unusable(report: Mapping[str, Any]) -> str | None:
     if placed >= LEAST * count:
         return None
     return (
-        f"only {placed} of {count} photos are placed, so the scene is incomplete; capture.html in it says what to "
-        "photograph again"
+        f"only {placed} of {count} photos are placed, so the scene is incomplete; capture.html in it says which photos "
+        "to take"
     )
