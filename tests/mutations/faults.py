@@ -58,7 +58,7 @@ FAULTS = (
     Fault(
         "half of a warp's lanes not summed",
         "ROCm/gsplat#18",
-        f"{CSRC}/cuda/pixel_sums.cuh",
+        f"{CSRC}/cuda/backward/pixel_sums.cuh",
         "        kept[i] = v[i] + __shfl_xor_sync(kWarp, v[i], kStep);\n",
         "        kept[i] = v[i];\n",
     ),
