@@ -216,6 +216,15 @@ def test_the_map_of_csrc_names_its_sources_and_operators():
     assert sorted(name for name in operators if f"`{name}`" not in map_of_csrc) == []
 
 
+def test_nothing_needs_the_function_of_gsplat():
+    """Its folders can be deleted, with the tests and benchmarks that csrc/README.md names."""
+    for path in (path for path in _csrc() if "gsplat" not in path.parts):
+        assert not [name for name in _includes(path) if name.startswith("gsplat/")], path
+    words = re.compile(r"diff_gaussian_rasterization\.gsplat|\b(?:OPERATORS|ops)\.(?:describe\w*|pinhole)\b")
+    for path in (path for path in _python() if not {"gsplat", "benchmarks"} & set(path.parts)):
+        assert not words.search(path.read_text(encoding="utf-8")), path
+
+
 def test_tensors_are_seen_in_one_folder():
     for path in _csrc():
         if "torch" not in path.relative_to(CSRC).as_posix():

@@ -16,15 +16,17 @@ import torch
 from torch import Tensor
 from torch.utils.weak import TensorWeakRef
 
+import diff_gaussian_rasterization.gsplat.fakes  # noqa: F401  (registers the fake kernels)
 from diff_gaussian_rasterization.alternatives import MOST_BANDS, MOST_DEGREE
 from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.channels import MOST_CHANNELS
 from diff_gaussian_rasterization.first_order import needs_function
-from diff_gaussian_rasterization.gsplat_inputs import Call, Item, checked, items_of
-from diff_gaussian_rasterization.gsplat_meta import Meta
+from diff_gaussian_rasterization.gsplat.description import described
+from diff_gaussian_rasterization.gsplat.inputs import Call, Item, checked, items_of
+from diff_gaussian_rasterization.gsplat.meta import Meta
 from diff_gaussian_rasterization.harmonics import sh_values
 from diff_gaussian_rasterization.lens import Lens
-from diff_gaussian_rasterization.stages import Blending, Shared, blended, described, projected
+from diff_gaussian_rasterization.stages import Blending, Shared, blended, projected
 
 _ENDLESS = 1e10  # far_plane, if nobody gives one
 _MOST_ALPHA = 0.999
@@ -346,9 +348,3 @@ class _Lengths(NamedTuple):
             means2d.absgrad = torch.zeros_like(means2d)
         into = means2d.absgrad.flatten(0, -3)[self.place] if self.rows is None else means2d.absgrad[self.place]
         into[:, 0] = (lengths if self.rows is None else lengths[self.rows]) * (2 / self.width)
-
-
-if __name__ == "__main__":
-    from diff_gaussian_rasterization.gsplat_programs import run
-
-    run()
