@@ -37,7 +37,6 @@ FAULTS = (
         f"{CSRC}/math/absolute.h",
         "return length(",
         "return T(0) * length(",
-        ("--absgrad",),
     ),
     Fault(
         "no gradient through the compensation",
@@ -45,7 +44,6 @@ FAULTS = (
         f"{CSRC}/math/footprint.h",
         "if (antialiasing && any(!f.floored)) {",
         "if (antialiasing && false) {",
-        ("--antialiasing",),
     ),
     Fault(
         "wrong derivative of the 2D filter",
@@ -53,7 +51,6 @@ FAULTS = (
         f"{CSRC}/math/footprint.h",
         "inverse_ratio = 1 / (f.compensation * f.compensation)",
         "inverse_ratio = 1 / f.compensation",
-        ("--antialiasing",),
     ),
     Fault(
         "half of a warp's lanes not summed",
