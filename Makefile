@@ -24,7 +24,7 @@ DOCS_VENV := .venv-docs
 CHECK_PYTHON := import sys; sys.exit(sys.version_info < (3, 10) and "Python 3.10 or newer is needed: make PYTHON=...")
 EXTENSIONS := simple-knn fused-ssim diff-gaussian-rasterization
 CXX_TESTS := $(patsubst submodules/%.cpp,build/%,$(wildcard submodules/*/csrc/tests/*.cpp))
-CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(wildcard submodules/*/csrc/cpu/*.cpp))
+CXX_TEST_OBJECTS := $(patsubst submodules/%.cpp,build/%.o,$(shell find submodules/*/csrc -path '*/cpu/*.cpp'))
 CORES := $(shell nproc 2> /dev/null || getconf _NPROCESSORS_ONLN)
 # The address sanitizer sees what the checks see that are left out, which take a third of the compiler's time.
 CXX_TEST_FLAGS := -std=c++17 -O1 -Wall -Wextra -Werror -fsanitize=address,undefined -fno-sanitize-recover=all -pthread \
@@ -134,8 +134,9 @@ EMULATION := submodules/common/emulation
 EMULATION_FILES := $(shell find $(EMULATION) -type f ! -name '*.py*')
 EMULATION_FLAGS := -Wno-unknown-pragmas -I$(EMULATION) -iquote$(EMULATION)
 translation = build/$(1)/csrc/tests/emulated/translated
-kernels = $(patsubst submodules/%.cu,build/%.o,$(subst /cuda/,/tests/emulated/,$(wildcard submodules/$(1)/csrc/cuda/*.cu)))
-compile_emulated = $(call compile,$(1)) -Ibuild/$(1)/csrc/tests/emulated -Isubmodules/$(1)/csrc/cuda $(EMULATION_FLAGS)
+kernels = $(patsubst submodules/%.cu,build/%.o,\
+          $(subst /csrc/,/csrc/tests/emulated/,$(shell find submodules/$(1)/csrc -name '*.cu')))
+compile_emulated = $(call compile,$(1)) -iquotebuild/$(1)/csrc/tests/emulated $(EMULATION_FLAGS)
 CXX_EMULATION_OBJECTS := build/emulation.o $(CXX_EMULATED:%=%.o) \
                          $(foreach test,$(CXX_EMULATED:build/%=%),$(call kernels,$(call submodule,$(test))))
 
@@ -151,7 +152,7 @@ $(filter-out build/emulation.o %_emulated.o,$(CXX_EMULATION_OBJECTS)): build/%.o
 
 build/%/csrc/tests/emulated/translated: $$(call sources,$$*) $(EMULATION_FILES) $(EMULATION)/translate.py
 	rm -rf $(@D) && mkdir -p $(@D)
-	$(PYTHON) $(EMULATION)/translate.py $(@D) $(wildcard submodules/$*/csrc/cuda/*.cu*)
+	$(PYTHON) $(EMULATION)/translate.py submodules/$*/csrc $(@D)
 	@touch $@
 
 build/emulation.o: $(EMULATION_FILES) $(wildcard submodules/common/include/gs/*.h)

@@ -111,7 +111,7 @@ def build(target: Target, isa: str, extension: str) -> Path:
     compiler = [*command_of(target.compiler), *FLAGS, *includes, *target.isas[isa]]
 
     def compilations() -> Iterator[list[str]]:
-        for source in sorted((ROOT / csrc / "cpu").glob("*.cpp")):
+        for source in sorted((ROOT / csrc).rglob("cpu/*.cpp")):
             once = [] if source.stem.endswith("_isa") else [ROUNDED]
             yield [*compiler, *once, "-c", str(source), "-o", str(folder / f"{source.stem}.o")]
 

@@ -1,7 +1,7 @@
 """Adam's tensors as the rasterizer's backward takes them, so that it steps the Gaussians itself."""
 
 from collections.abc import Collection, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 from diff_gaussian_rasterization.backend import OPERATORS
@@ -48,18 +48,15 @@ class FusedAdam:
             and all(_is_plain(gaussians.raw(name)) for name in _STEPPED)
         )
 
-    def arguments(self, observe: bool, camera: Tensor | None = None) -> tuple[Any, ...]:
-        """Arguments of the operator from `averages` to `iteration`, for the next step. observe: with the statistics.
-
-        camera: as for `apply`.
-        """
+    def arguments(self, observe: bool) -> "StepArguments":
+        """Arguments of the operator for the next step. observe: with the statistics."""
         optimizer, stepping = self._gaussians.optimizer, list(self._stepping())
         each = self._penalty.per_value(self._gaussians.gaussian_count)
         *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
-        return (
+        return StepArguments(
             [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],
             [one.state["step"] for one in stepping],
-            (*(self._statistics() if observe else ()), *(() if camera is None else (camera,))),
+            self._statistics() if observe else (),
             guard,
             [one.attribute for one in stepping],
             [one.rate for one in stepping],
@@ -89,7 +86,7 @@ class FusedAdam:
         gaussians, view, *options = scene.lists
         view = view if awake is None else (*view, awake)
         # By place: names would cost the operator microseconds.
-        arguments = source, planes, [], radii, *self.arguments(observe, camera), now, absolute
+        arguments = source, planes, [], radii, *self.arguments(observe), now, absolute, camera
         OPERATORS.apply_gradients_(gaussians, view, *options, *arguments)
 
     def write_now(self, now: Tensor, iteration: int) -> None:
@@ -131,6 +128,21 @@ class FusedAdam:
             if name in self._left_out or not param.numel() or (active == 0 and sparse):
                 continue  # it has no gradient, and the optimiser would pass it over
             yield _Stepping(place, param, optimizer.state_of(param), groups[name]["lr"], active)
+
+
+class StepArguments(NamedTuple):
+    """What `apply_gradients_` takes for a step, in its order; lists have an entry for each attribute that steps."""
+
+    averages: list[Tensor]  # exp_avg of all, then exp_avg_sq
+    steps: list[Tensor]  # counters
+    statistics: tuple[Tensor, ...]  # max_radii, gradient_sums and views, or none
+    guard: list[Tensor]  # loss and stopped, or none
+    attributes: list[int]  # places in gs::Stepped
+    rates: list[float]
+    constants: list[float]  # beta1, beta2, eps, penalties of opacities and of scales
+    columns: list[int]
+    sparse: bool
+    iteration: int
 
 
 class _Stepping(NamedTuple):

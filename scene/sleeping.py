@@ -165,7 +165,6 @@ class Sleeping:
         return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))
 
     def _wake(self, scene: Scene, every: bool, now: Tensor | None = None) -> Tensor | None:
-        averages, steps, _, guard, attributes, rates, constants, columns, _, iteration = self._adam.arguments(False)
-        sleep = [self.awake, self._taken, self._terms]
-        step = averages, steps, guard, attributes, rates, constants, columns, iteration, now
-        return OPERATORS.wake_(*scene.lists, sleep, every, *step)
+        step, sleep = self._adam.arguments(False), [self.awake, self._taken, self._terms]
+        lists = step.averages, step.steps, step.guard, step.attributes, step.rates, step.constants, step.columns
+        return OPERATORS.wake_(*scene.lists, sleep, every, *lists, step.iteration, now)

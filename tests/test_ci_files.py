@@ -42,7 +42,7 @@ def test_cuda_sources_are_all_compiled(tmp_path):
     environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
     subprocess.run([ROOT / ".ci" / "compile_cuda", "sm_80"], env=environment, check=True, capture_output=True)
     compiled = re.findall(r"-arch=sm_80 .*-c (\S+)", (tmp_path / "calls").read_text())
-    sources = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("submodules/*/csrc/cuda/*.cu"))
+    sources = sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("submodules/*/csrc/**/*.cu"))
     assert sorted(compiled) == sources and len(sources) > 10
     nvcc.write_text("#!/bin/sh\nexit 1\n")
     assert subprocess.run([ROOT / ".ci" / "compile_cuda"], env=environment, capture_output=True).returncode != 0

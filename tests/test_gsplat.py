@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 import scipy.special
 import torch
-from diff_gaussian_rasterization import gsplat_programs
-from diff_gaussian_rasterization.gsplat import rasterization
-from diff_gaussian_rasterization.gsplat_inputs import MODES
+from diff_gaussian_rasterization.gsplat import programs, rasterization
+from diff_gaussian_rasterization.gsplat.inputs import MODES
 from diff_gaussian_rasterization.harmonics import sh_basis
 from rasterizer_tools import CPU_AND_GPU
 from torch import Tensor
@@ -637,7 +636,7 @@ def test_strategies_before_1_5_get_one_radius(monkeypatch):
     own[0].rendering, own[0].__version__ = own[1], "1.4.0"
     for module in own:
         monkeypatch.setitem(sys.modules, module.__name__, module)
-    gsplat_programs.install()
+    programs.install()
     given = Inputs(1)
     rest = given.views, given.Ks, WIDTH, HEIGHT
     meta = own[1].rasterization(given.means, given.quats, given.scales, given.opacities, given.colors, *rest)[2]
@@ -648,7 +647,7 @@ def test_parts_of_a_gaussian_follow_the_papers_double_sum():
     opacities, count = torch.tensor([0.3, 0.9, 0.5, 0.99, 0.2], dtype=DOUBLE), torch.tensor([1, 2, 5, 17, 80])
     most = 51
     binoms = torch.tensor([[math.comb(n, k) for k in range(most)] for n in range(most)], dtype=DOUBLE)
-    parts, scales = gsplat_programs.relocated(opacities, torch.ones(5, 3, dtype=DOUBLE), count, binoms, 0.0)
+    parts, scales = programs.relocated(opacities, torch.ones(5, 3, dtype=DOUBLE), count, binoms, 0.0)
     for n, (opacity, number) in enumerate(zip(opacities.tolist(), count.clamp_max(most).tolist(), strict=True)):
         part = 1 - (1 - opacity) ** (1 / number)
         sums = (
@@ -658,7 +657,7 @@ def test_parts_of_a_gaussian_follow_the_papers_double_sum():
         )
         assert parts[n].item() == pytest.approx(part)
         assert scales[n].tolist() == pytest.approx([opacity / math.fsum(sums)] * 3, rel=1e-6)
-    assert gsplat_programs.relocated(opacities, scales, count, binoms)[0].min() == 0.005
+    assert programs.relocated(opacities, scales, count, binoms)[0].min() == 0.005
 
 
 def test_a_gsplat_that_lacks_something_is_not_replaced(tmp_path, monkeypatch):
@@ -667,7 +666,7 @@ def test_a_gsplat_that_lacks_something_is_not_replaced(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "gsplat", raising=False)
     with pytest.raises(ModuleNotFoundError, match="jaxtyping_that_is_not_there"):
-        gsplat_programs.install()
+        programs.install()
 
 
 @pytest.mark.parametrize("installed", [False, True])
@@ -684,11 +683,11 @@ def test_a_program_finds_it_by_gsplats_name(installed, tmp_path, monkeypatch, ca
         "print(gsplat.rasterization is rasterization, rasterization.__module__, sys.argv[1:])\n"
     )
     monkeypatch.setattr(sys, "argv", ["python -m", str(program), "--steps", "3"])
-    gsplat_programs.run()
+    programs.run()
     assert capsys.readouterr().out == "True diff_gaussian_rasterization.gsplat ['--steps', '3']\n"
     monkeypatch.setattr(sys, "argv", ["python -m"])
     with pytest.raises(SystemExit, match="name a program"):
-        gsplat_programs.run()
+        programs.run()
     monkeypatch.setattr(sys, "argv", ["python -m", "nowhere.py"])
     with pytest.raises(SystemExit, match="there is no program nowhere.py"):
-        gsplat_programs.run()
+        programs.run()

@@ -182,12 +182,46 @@ def _includes(path: Path) -> list[str]:
 
 
 def test_the_arithmetic_includes_nothing_above_it():
-    headers = list(CSRC.glob("*/csrc/math/*.h"))
+    headers = list(CSRC.rglob("math/*.h"))
     assert len(headers) > 15
     for path in headers:
         for name in _includes(path):
-            own = (path.parent / name).is_file() or name.startswith(("math/", "gs/")) or name == "data.h"
+            own = (path.parent / name).is_file() or name.startswith(("math/", "gs/")) or Path(name).name == "data.h"
             assert own or re.fullmatch(r"c?\w+", name), f"{path.relative_to(CSRC)} includes {name}"
+
+
+# The phases of csrc/cuda: a file includes its own folder and those before.
+PHASES = ("queue", "project", "bin", "blend", "step", "backward", "ranks")
+RASTERIZER = CSRC / "diff-gaussian-rasterization"
+
+
+def test_a_kernel_includes_no_later_phase():
+    files = [path for path in _csrc() if RASTERIZER / "csrc" / "cuda" in path.parents]
+    assert len(files) > 40
+    for path in files:
+        for name in _includes(path):
+            if name.startswith("cuda/") and name.endswith(".cuh"):
+                phases = PHASES[: PHASES.index(path.parent.name) + 1]
+                assert name.split("/")[1] in phases, f"{path.relative_to(CSRC)} includes {name}"
+
+
+def test_the_map_of_csrc_names_its_sources_and_operators():
+    map_of_csrc = (RASTERIZER / "csrc" / "README.md").read_text(encoding="utf-8")
+    sources = [path for path in _csrc() if RASTERIZER in path.parents and path.suffix in (".cpp", ".cu")]
+    sources = [path for path in sources if path.stem not in ("backward", "scene")]  # of all operators
+    operators = {name for path in sources for name in re.findall(r'define(?:_for_all)?\(\s*"(\w+)\(', path.read_text())}
+    assert len(sources) > 40 and len(operators) > 25
+    assert [path.name for path in sources if path.name not in map_of_csrc] == []
+    assert sorted(name for name in operators if f"`{name}`" not in map_of_csrc) == []
+
+
+def test_nothing_needs_the_function_of_gsplat():
+    """Its folders can be deleted, with the tests and benchmarks that csrc/README.md names."""
+    for path in (path for path in _csrc() if "gsplat" not in path.parts):
+        assert not [name for name in _includes(path) if name.startswith("gsplat/")], path
+    words = re.compile(r"diff_gaussian_rasterization\.gsplat|\b(?:OPERATORS|ops)\.(?:describe\w*|pinhole)\b")
+    for path in (path for path in _python() if not {"gsplat", "benchmarks"} & set(path.parts)):
+        assert not words.search(path.read_text(encoding="utf-8")), path
 
 
 def test_tensors_are_seen_in_one_folder():

@@ -244,7 +244,7 @@ WRONG = {
         (RuntimeError, "statistics must be 3 float32", {"statistics": _changed(2, torch.ones(2))}),
         (RuntimeError, "statistics must be contiguous", {"statistics": _changed(2, torch.ones(6)[::2])}),
         (RuntimeError, "max_radii, gradient_sums and views, or none", {"statistics": lambda t: t[:2]}),
-        (ValueError, r"the camera's gradient must be \(34,\)", {"statistics": lambda t: [*t, torch.ones(25).double()]}),
+        (ValueError, r"the camera's gradient must be \(34,\)", {"camera_gradient": torch.ones(25).double()}),
         (RuntimeError, "stopped must be one int64", {"guard": lambda t: [t[0], t[0]]}),
         (RuntimeError, "stopped must be one int64", {"guard": _changed(1, torch.zeros(1))}),
         (RuntimeError, "count from 1", {"iteration": 0}),

@@ -1,4 +1,6 @@
-"""Builds torch extensions with a CPU backend and, once they have csrc/cuda/*.cu, a CUDA one.
+"""Builds torch extensions with a CPU backend and, once they have kernels, a CUDA one.
+
+Sources are those below a folder `cpu`, `cuda` or `torch` at any depth of csrc.
 
 Each extension's setup.py calls `setup_extension`, and the repository's own passes `extension_options` for all of them;
 pip does the rest. The result is <package>/_backend.so, which registers its operators when torch.ops.load_library loads
@@ -133,13 +135,13 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
         isas = ARM64_ISAS
     ops_flags = ["-isystem", str(headers)]
     ops_flags += [f"-DTORCH_TARGET_VERSION={target_version(OLDEST_TORCH)}"]
-    kernels = sorted((csrc / "cuda").glob("*.cu")) if nvcc else []
+    kernels = find_sources(csrc, "cuda", ".cu") if nvcc else []
     if kernels:
         ops_flags += ["-DGS_CUDA", "-DUSE_CUDA", "-isystem", str(toolkit_root(nvcc) / "include")]
 
-    ops = sorted((csrc / "torch").glob("*.cpp"))
+    ops = find_sources(csrc, "torch", ".cpp")
     plan = [Compilation([*compile_cxx, *ops_flags], source, objects / f"{source.stem}.torch.o") for source in ops]
-    sources = sorted((csrc / "cpu").glob("*.cpp"))
+    sources = find_sources(csrc, "cpu", ".cpp")
     # Sources that are compiled once round alike on every machine, so products are never fused (gs/rounded.h).
     once = [*compile_cxx, "-ffp-contract=off"]
     plan += [Compilation(once, source, objects / f"{source.stem}.o") for source in sources if not is_per_isa(source)]
@@ -160,6 +162,12 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
             seed = [f"-frandom-seed={source.stem}"] if seeded else []
             plan.append(Compilation([*compile_cuda, *seed], source, objects / f"{source.stem}.cu.o"))
     return plan
+
+
+def find_sources(csrc: Path, folder: str, ending: str) -> list[Path]:
+    """Sources below folders of a name, at any depth, by their own names, which differ and which objects take."""
+    found = [path for path in csrc.rglob(f"*{ending}") if folder in path.relative_to(csrc).parts[:-1]]
+    return sorted(found, key=lambda path: path.name)
 
 
 def compile_one(compilation: Compilation) -> None:

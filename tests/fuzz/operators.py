@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
+import diff_gaussian_rasterization.gsplat  # noqa: F401  (registers the fakes of `describe` and `pinhole`)
 import torch
 from diff_gaussian_rasterization.scene import Drawing
 from fused_ssim.backend import OPERATORS as ssim

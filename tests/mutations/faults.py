@@ -37,7 +37,6 @@ FAULTS = (
         f"{CSRC}/math/absolute.h",
         "return length(",
         "return T(0) * length(",
-        ("--absgrad",),
     ),
     Fault(
         "no gradient through the compensation",
@@ -45,7 +44,6 @@ FAULTS = (
         f"{CSRC}/math/footprint.h",
         "if (antialiasing && any(!f.floored)) {",
         "if (antialiasing && false) {",
-        ("--antialiasing",),
     ),
     Fault(
         "wrong derivative of the 2D filter",
@@ -53,12 +51,11 @@ FAULTS = (
         f"{CSRC}/math/footprint.h",
         "inverse_ratio = 1 / (f.compensation * f.compensation)",
         "inverse_ratio = 1 / f.compensation",
-        ("--antialiasing",),
     ),
     Fault(
         "half of a warp's lanes not summed",
         "ROCm/gsplat#18",
-        f"{CSRC}/cuda/pixel_sums.cuh",
+        f"{CSRC}/cuda/backward/pixel_sums.cuh",
         "        kept[i] = v[i] + __shfl_xor_sync(kWarp, v[i], kStep);\n",
         "        kept[i] = v[i];\n",
     ),

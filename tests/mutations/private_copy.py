@@ -145,8 +145,9 @@ class PrivateCopy:
     def _emulate(self, path: Path) -> None:
         """Build the test of the CUDA kernels, with an altered source of theirs."""
         source = path.relative_to(self.tree)
-        made = Path(TESTS, "emulated", source.with_suffix(".cpp").name if source.suffix == ".cu" else source.name)
-        self.run([sys.executable, "submodules/common/emulation/translate.py", str(made.parent), str(source)])
+        made = Path(TESTS, "emulated", source.relative_to(CSRC))
+        made = made.with_suffix(".cpp") if made.suffix == ".cu" else made
+        self.run([sys.executable, "submodules/common/emulation/translate.py", CSRC, f"{TESTS}/emulated"])
         for note in (self.tree / TESTS).rglob("*.d"):
             if made in _needs(note):
                 note.with_suffix(".o").unlink(missing_ok=True)

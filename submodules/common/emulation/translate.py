@@ -1,6 +1,6 @@
 """Translate .cu files to C++ that compiles with the headers of this folder.
 
-python translate.py FOLDER FILE...    writes the translations of X.cu and X.cuh to FOLDER/X.cpp and FOLDER/X.cuh
+python translate.py CSRC FOLDER    writes the translations of CSRC/cuda/X.cu and X.cuh to FOLDER/cuda/X.cpp and X.cuh
 """
 
 import re
@@ -23,7 +23,10 @@ def translate(source: str) -> str:
 
 
 if __name__ == "__main__":
-    folder = Path(sys.argv[1])
-    for path in map(Path, sys.argv[2:]):
-        name = path.with_suffix(".cpp").name if path.suffix == ".cu" else path.name
-        (folder / name).write_text(f'#line 1 "{path}"\n' + translate(path.read_text()))
+    csrc, folder = map(Path, sys.argv[1:])
+    for path in csrc.rglob("*.cu*"):
+        to = folder / path.relative_to(csrc)
+        to.parent.mkdir(parents=True, exist_ok=True)
+        to.with_suffix(".cpp" if path.suffix == ".cu" else ".cuh").write_text(
+            f'#line 1 "{path}"\n' + translate(path.read_text())
+        )

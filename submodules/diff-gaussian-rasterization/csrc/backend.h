@@ -68,16 +68,6 @@ template <class T>
 void list_records(const Executor&, const RecordInput&, const RecordLists<T>&);
 template <class T>
 void sum_runs(const Executor&, const SumInput<T>&);
-template <class T>
-void describe(const Executor&, const DescribeInput<T>&, const Descriptions<T>&);
-// Writes the numbers of the splats that are shown, ascending. Returns how many there are.
-template <class T>
-int64_t list_shown(const Executor&, const DescribeInput<T>&, int64_t* rows);
-template <class T>
-void describe_vjp(const Executor&, const DescribedInput<T>&, const DescribedGradient<T>&);
-template <class T>
-void pinhole(const Executor&, const T* pose, const T* intrinsics, Image, const PinholeMatrices<T>&);
-
 // What else the CPU offers. sum_rows: the rest of blend_vjp after blend_rows. project_vjp_step: project_vjp, and every
 // Gaussian's step as soon as its gradients are known. camera_vjp: what each block of kSleepBlock
 // Gaussians adds to the gradients of the camera's numbers, (blocks, numbers) (math/camera_gradient.h).
@@ -106,12 +96,6 @@ void random_words(const Queue&, const RandomInput&);
 void count_records(const Queue&, const RecordInput&, int32_t* counts);
 void list_records(const Queue&, const RecordInput&, const RecordLists<float>&);
 void sum_runs(const Queue&, const SumInput<float>&);
-void describe(const Queue&, const DescribeInput<float>&, const Descriptions<float>&);
-int64_t list_shown(const Queue&, const DescribeInput<float>&, int64_t* rows);
-void describe_vjp(const Queue&, const DescribedInput<float>&, const DescribedGradient<float>&);
-// In float64 as well.
-template <class T>
-void pinhole(const Queue&, const T* pose, const T* intrinsics, Image, const PinholeMatrices<T>&);
 // Allocates the gradients; called while the GPU is busy, so that the host's work costs no time.
 struct GradientMemory {
   SceneGradient<float> (*take)(void* context);
@@ -133,7 +117,6 @@ void camera_vjp(const Queue&, const Scene<float>&, const SplatRows<float>&, doub
 void camera_vjp(const Queue&, const Scene<float>&, const int32_t* tile_counts, const float* moments, double* sums);
 void sum_blocks(const Queue&, int64_t blocks, int64_t numbers, const double* sums, double* out);
 }  // namespace cuda
-using cuda::describe, cuda::describe_vjp, cuda::list_shown, cuda::pinhole;
 using cuda::observe, cuda::displace, cuda::elementary, cuda::random_words, cuda::count_records;
 
 }  // namespace gs

@@ -1,5 +1,7 @@
 """Fake kernels: shapes and dtypes of the operators' results, for torch.compile and opcheck of torch's library."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, library
 
@@ -20,7 +22,8 @@ CAMERA_NUMBERS = 25, 34  # of a pinhole, and of a camera with a lens
 RECORD_BLOCK = 256  # splats whose records are counted together
 
 
-def _fake(name: str):
+def fake(name: str) -> Callable:
+    """Makes the decorator that registers the fake kernel of an operator."""
     return library.register_fake(f"diff_gaussian_rasterization::{name}")
 
 
@@ -52,14 +55,14 @@ def _splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) ->
     return means.new_empty((means.shape[0], values))
 
 
-@_fake("project")
+@fake("project")
 def _(means, *arguments):
     count = means.shape[0]
     ints = [means.new_empty(shape, dtype=torch.int32) for shape in ((count, 4), (count,), (count,))]
     return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints
 
 
-@_fake("project_binned")
+@fake("project_binned")
 def _(means, *arguments):
     count, (height, width, *_), train = means.shape[0], arguments[11], arguments[12]
     ints = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
@@ -67,17 +70,17 @@ def _(means, *arguments):
     return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints, *lists
 
 
-@_fake("bin")
+@fake("bin")
 def _(splats, depths, rects, tile_counts, height, width, train):
     return _binned(splats, splats.shape[0], height, width, train)
 
 
-@_fake("blend")
+@fake("blend")
 def _(splats, instances, ranges, background, height, width, inverse_depth, train):
     return _blended(splats, height, width, inverse_depth, train)
 
 
-@_fake("blend_rows")
+@fake("blend_rows")
 def _(source, *arguments):
     absolute = len(arguments) == 4 and arguments[-1]  # the dispatcher leaves a default out
     splats = source[0]
@@ -86,14 +89,14 @@ def _(source, *arguments):
     return rows, splats.new_empty((splats.shape[0],), dtype=torch.int32)
 
 
-@_fake("blend_channels")
+@fake("blend_channels")
 def _(splats, channels, instances, ranges, background, height, width, cap, channels_last=False):
     image = (1, height, width, channels.shape[1]) if channels_last else (channels.shape[1], height, width)
     last, alpha = splats.new_empty((height, width), dtype=torch.int32), (1, height, width, 1) if channels_last else (0,)
     return splats.new_empty(image), splats.new_empty((1, height, width)), last, splats.new_empty(alpha)
 
 
-@_fake("channel_moments")
+@fake("channel_moments")
 def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wanted, channels_last=False):
     splats = source[0]
     count = splats.shape[0]
@@ -101,27 +104,7 @@ def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wa
     return torch.empty_like(splats), lengths, splats.new_empty((count if wanted else 0, channels.shape[1]))
 
 
-@_fake("describe_vjp")
-def _(splats, tile_counts, moments, rows=None):
-    count = (splats if rows is None else rows).shape[0]
-    return tuple(splats.new_empty((count, *row)) for row in ((2,), (3,), ()))
-
-
-@_fake("pinhole")
-def _(pose, intrinsics, height, width):
-    return pose.new_empty((4, 4)), pose.new_empty((4, 4)), pose.new_empty((3,))
-
-
-@_fake("describe")
-def _(splats, depths, tile_counts, height, width, packed=False):
-    count = library.get_ctx().new_dynamic_size() if packed else splats.shape[0]
-    floats = (splats.new_empty((count, *row)) for row in ((2,), (), (3,), ()))
-    listed = (count if packed else 0,)
-    radii, tiles = (splats.new_empty(shape, dtype=torch.int32) for shape in ((count, 2), listed))
-    return radii, *floats, tiles, splats.new_empty(listed, dtype=torch.int64)
-
-
-@_fake("rasterize_vjp")
+@fake("rasterize_vjp")
 def _(means, opacities, *arguments):
     sh_rest, wanted = arguments[5], arguments[11]
     rows = _ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
@@ -130,19 +113,19 @@ def _(means, opacities, *arguments):
     return tuple(means.new_empty((count, *rows[name])) for name, count in zip(GRADIENTS, counts, strict=True))
 
 
-@_fake("camera_vjp")
+@fake("camera_vjp")
 def _(means, *arguments):
     lens = arguments[10]
     blocks = -(-means.shape[0] // SLEEP_BLOCK)
     return means.new_empty((blocks, CAMERA_NUMBERS[len(lens) > 5]), dtype=torch.float64)
 
 
-@_fake("sum_blocks")
+@fake("sum_blocks")
 def _(sums):
     return sums.new_empty(sums.shape[1:])
 
 
-@_fake("rasterize")
+@fake("rasterize")
 def _(means2d, means, *arguments):
     options, _, inverse_depth, train = arguments[11:15]  # what follows is left out where it has its default
     count, (height, width, *_) = means.shape[0], options
@@ -153,12 +136,12 @@ def _(means2d, means, *arguments):
     return color, transmittance, depth, *projected, *lists, last, layers
 
 
-@_fake("decisive")
+@fake("decisive")
 def _(splats, *_):
     return splats.new_empty((splats.shape[0],), dtype=torch.bool)
 
 
-@_fake("list_records")
+@fake("list_records")
 def _(rects, tile_counts, limits, counts=None, splats=None, depths=None, room=0):
     if counts is None:
         counts = rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
@@ -167,16 +150,16 @@ def _(rects, tile_counts, limits, counts=None, splats=None, depths=None, room=0)
     return *lists, *(t.new_empty((room, *t.shape[1:])) for t in (splats, depths, rects, tile_counts))
 
 
-@_fake("sum_runs")
+@fake("sum_runs")
 def _(rows, counts, kept, room, places=None):
     return rows.new_empty((room, rows.shape[1]))
 
 
-@_fake("adam_")
-@_fake("apply_gradients_")
-@_fake("displace_")
-@_fake("observe_")
-@_fake("penalise_")
-@_fake("step_now_")
+@fake("adam_")
+@fake("apply_gradients_")
+@fake("displace_")
+@fake("observe_")
+@fake("penalise_")
+@fake("step_now_")
 def _(*_args, **_keywords):
     return None

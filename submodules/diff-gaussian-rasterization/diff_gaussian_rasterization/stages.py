@@ -1,9 +1,9 @@
-"""An image of channels in three stages, each a function of autograd: projection, description, blending.
+"""An image of channels in two stages, each a function of autograd: projection and blending.
 
 The gradient of `splats` is moments (csrc/math/footprint.h) in place of gradients of their values, from which projection
-makes gradients without loss. Where splats are described, blending sends the moments to the description, and beside them
-the same as gradients of means, conics and opacities, so that hooks see them. Gradients that come back changed are
-turned into moments.
+makes gradients without loss. A third stage may describe splats in between, as that of gsplat's function does. Then
+blending sends it the moments, and beside them the same as gradients of means, conics and opacities, so that hooks see
+them.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,6 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.first_order import direct_apply, first_order
 
 _TENSORS = 11  # of a Scene, which come first
-_TWO_LN2 = 1.3862943611198906
 _ROW_Z, _SHIFT_Z = slice(6, 9), 11  # of the camera's numbers (camera.py)
 
 
@@ -35,12 +34,14 @@ class Blending(NamedTuple):
 class Shared:
     """What an image's stages tell each other during a backward pass."""
 
-    __slots__ = ("hooks", "lengths", "moments", "sent", "shown", "task", "use_lengths")
+    __slots__ = ("describe_moments", "hooks", "lengths", "moments", "sent", "shown", "task", "use_lengths")
 
     def __init__(self) -> None:
         self.lengths: Tensor | None = None  # of absolute gradients, (N,)
         self.shown: Tensor | None = None  # (N,) int32: not 0 of rows that get gradients beside those of the image
         self.use_lengths: Callable[[Tensor], None] | None = None
+        # Gradients of means2d, conics and opacities as described, from splats, tile_counts, moments and rows.
+        self.describe_moments: Callable[..., Sequence[Tensor]] | None = None
         self.hooks: list[Callable[[], dict | None]] = []  # those of the description, each None once it is gone
         self.task = self.moments = self.sent = None
 
@@ -109,83 +110,6 @@ class _Projected(Function):
         return tuple(results)
 
 
-class _Described(Function):
-    """Inputs: `Shared`, height and width, whether rows are packed, splats that keep their shapes, depths, tile_counts.
-
-    Results (1, N, ...), or of the rows that are shown: radii, means2d, depths, conics, opacities, tiles, then the rows.
-    """
-
-    @staticmethod
-    def forward(
-        ctx: Any, shared: Shared, size: tuple[int, int], packed: bool, splats: Tensor, depths: Tensor,
-        tile_counts: Tensor,
-    ) -> tuple[Tensor | None, ...]:  # fmt: skip
-        with torch._C._AutoDispatchBelowAutograd():
-            *found, tiles, rows = OPERATORS.describe(splats, depths, tile_counts, *size, packed)
-        if packed:
-            found.append(tiles)
-        else:
-            found, rows = [values[None] for values in (*found, tile_counts)], None
-        ctx.shared = shared
-        ctx.set_materialize_grads(False)
-        ctx.save_for_backward(splats, tile_counts, rows, found[0])
-        ctx.mark_non_differentiable(found[0], found[5])
-        if packed:
-            ctx.mark_non_differentiable(rows)
-        return *found, rows
-
-    @staticmethod
-    @first_order("rasterization")
-    def backward(ctx: Any, _: Any, centers: Tensor, of_depth: Tensor, conics: Tensor, opacities: Tensor, *__) -> tuple:
-        splats, tile_counts, rows, radii = ctx.saved_tensors
-        moments, marks = ctx.shared.take()
-        given = [centers, conics, opacities]
-        same = [None if values is None else (values.data_ptr(), values._version) for values in given] == marks
-        same = same and not any(hooks() for hooks in ctx.shared.hooks)  # which may change values and no mark
-        if not same or of_depth is not None:
-            if rows is None:
-                shown = torch.maximum(tile_counts, radii[0].amin(-1))
-            else:
-                shown = tile_counts.index_fill(0, rows, 1)
-            ctx.shared.shown = shown
-        if not same:
-            moments = torch.zeros_like(splats) if moments is None else moments
-            sent = OPERATORS.describe_vjp(splats, tile_counts, moments)
-            dense = [own if got is None else _dense(got, rows, splats) for got, own in zip(given, sent, strict=True)]
-            moments = _with_changes(moments, splats, shown, sent, dense)
-        if of_depth is not None:
-            of_depth = torch.where(shown > 0, _dense(of_depth, rows, splats), 0)
-        return None, None, None, moments, of_depth, None
-
-
-def _screen(splats: Tensor, tile_counts: Tensor, moments: Tensor, rows: Tensor | None) -> Sequence[Tensor]:
-    """Gradients of means2d, conics and opacities, as they are described."""
-    found = OPERATORS.describe_vjp(splats, tile_counts, moments, rows)
-    return [values[None] for values in found] if rows is None else found
-
-
-def _dense(packed: Tensor, rows: Tensor | None, splats: Tensor) -> Tensor:
-    """A value for each Gaussian, of a gradient of `_Described`."""
-    if rows is None:
-        return packed[0]
-    return packed.new_zeros(len(splats), *packed.shape[1:]).index_copy_(0, rows, packed)
-
-
-def _with_changes(
-    moments: Tensor, splats: Tensor, shown: Tensor, sent: Sequence[Tensor], given: Sequence[Tensor]
-) -> Tensor:
-    """Moments, but of what is given where that is not what was sent: gradients of means2d, conics and opacities."""
-    l11, l12, l22 = splats[:, 2].abs(), splats[:, 3], splats[:, 4]
-    centers, conics, opacities = given
-    u, xx, xy, yy = centers[:, 0] / (_TWO_LN2 * l11), -2 * conics[:, 0], -conics[:, 1], -2 * conics[:, 2]
-    mean = u, (centers[:, 1] / _TWO_LN2 - l12 * u) / l22
-    shape = l11 * l11 * xx + 2 * l11 * l12 * xy + l12 * l12 * yy, l22 * (l11 * xy + l12 * yy), l22 * l22 * yy
-    made = torch.stack([opacities * splats[:, 5].exp2(), *mean, *shape], 1)
-    moved, bent, dimmed = (got != own for got, own in zip(given, sent, strict=True))
-    differ = torch.stack([dimmed, *[moved.any(1)] * 2, *[bent.any(1)] * 3], 1) & (shown > 0)[:, None]
-    return torch.cat([torch.where(differ, made, moments[:, :6]), moments[:, 6:]], 1)
-
-
 class _Blended(Function):
     """Inputs: `Shared`, `Blending`, whether a backward follows, order (N,), the lists or rects, tile_counts, rows that
     are shown or None, splats, then means2d, conics, opacities and depths as described, or None, features (N, F) or
@@ -239,7 +163,7 @@ class _Blended(Function):
             if shared.use_lengths:
                 shared.use_lengths(lengths)
         if needed[8]:
-            screen = _screen(splats, tile_counts, moments, rows)
+            screen = shared.describe_moments(splats, tile_counts, moments, rows)
             shared.send(moments, screen)
             results[8:11] = screen
         else:
@@ -259,4 +183,4 @@ def _packed(values: Tensor, rows: Tensor | None) -> Tensor:
     return values[None] if rows is None else values[rows]
 
 
-projected, described, blended = map(direct_apply, (_Projected, _Described, _Blended))
+projected, blended = map(direct_apply, (_Projected, _Blended))

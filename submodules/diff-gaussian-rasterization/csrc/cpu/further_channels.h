@@ -1,7 +1,7 @@
 #pragma once
 // The channels behind the first four, which blending takes as it takes colours (tile_chunk.h). For them it finds once
-// what a splat weighs at a tile's pixels; then they take the weights in groups. The forward fuses products by name, or a
-// compiler would fuse some of them: a channel would have other bits by its place.
+// what a splat weighs at a tile's pixels; then they take the weights in groups. The forward fuses products by name, or
+// a compiler would fuse some of them: a channel would have other bits by its place.
 #include <vector>
 
 #include "gs/lane_halves.h"

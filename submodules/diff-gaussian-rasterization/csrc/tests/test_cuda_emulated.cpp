@@ -5,17 +5,17 @@
 
 #include "backend_run.h"
 #include "channels_run.h"
+#include "cuda/bin/make_records.cuh"
+#include "cuda/bin/sorted_lists.cuh"
+#include "cuda/blend/front_first.cuh"
 #include "emulated_queue.h"
 #include "exchange_run.h"
-#include "front_first.cuh"
 #include "gs/check_shared.h"
 #include "gs/gpu_forms.h"
 #include "long_lists.h"
-#include "make_records.cuh"
 #include "math/camera_gradient.h"
 #include "math/step_now.h"
 #include "rows_run.h"
-#include "sorted_lists.cuh"
 #include "step_run.h"
 
 namespace {

@@ -34,19 +34,20 @@ void advance(List<Tensor> steps) {
 }
 
 // What a step takes, in lists with an entry for each attribute that `attributes` names by its place in gs::Stepped.
-// averages: exp_avg of all these, then exp_avg_sq. statistics: max_radii, gradient_sums and views, or nothing; then, if
-// it is wanted, what gets the gradients of the camera's numbers before the step (camera_vjp). guard: loss and stopped,
-// or nothing. constants: beta1, beta2, eps, and the weights of the penalties on opacities and scales.
+// averages: exp_avg of all these, then exp_avg_sq. statistics: max_radii, gradient_sums and views, or nothing. guard:
+// loss and stopped, or nothing. constants: beta1, beta2, eps, and the weights of the penalties on opacities and scales.
+// camera_gradient: gets the gradients of the camera's numbers before the step (camera_vjp).
 #define STEP_SCHEMA                                                                                         \
   "Tensor? radii, Tensor(c!)[] averages, Tensor(d!)[] steps, Tensor(e!)[] statistics, Tensor(f!)[] guard, " \
   "int[] attributes=[], float[] rates=[], float[] constants=[], int[] columns=[], bool sparse=False, "      \
-  "int iteration=0, Tensor? now=None, bool absolute=False"
+  "int iteration=0, Tensor? now=None, bool absolute=False, Tensor(g!)? camera_gradient=None"
 #define STEP_PARAMETERS                                                                                             \
   const MaybeTensor &radii, List<Tensor> averages, List<Tensor> steps, List<Tensor> statistics, List<Tensor> guard, \
       Sizes attributes, List<double> rates, List<double> constants, Sizes columns, bool sparse, int64_t iteration,  \
-      const MaybeTensor &now, bool absolute
-#define STEP_ARGUMENTS \
-  radii, averages, steps, statistics, guard, attributes, rates, constants, columns, sparse, iteration, now, absolute
+      const MaybeTensor &now, bool absolute, const MaybeTensor &camera_gradient
+#define STEP_ARGUMENTS                                                                                                \
+  radii, averages, steps, statistics, guard, attributes, rates, constants, columns, sparse, iteration, now, absolute, \
+      camera_gradient
 
 // The entry of a list that may end before it.
 template <class T>
@@ -65,9 +66,9 @@ struct Step {
   int64_t iteration;
   const MaybeTensor& now;
   bool absolute;
+  const MaybeTensor& camera_gradient;
 
-  bool observes() const { return statistics.size() > 1; }
-  MaybeTensor camera() const { return entry(statistics, observes() ? 3 : 0); }
+  bool observes() const { return !statistics.empty(); }
 
   void check(const SceneTensors& scene) const {
     GS_CHECK_VALUE(!scene.has(kCov3d) && !scene.has(kColors),
@@ -75,15 +76,14 @@ struct Step {
     GS_CHECK_TYPE(radii, "radii must be a tensor, got None");
     check_tensor(*radii, "radii", ScalarType::Int, scene.device(), {scene.rows()});
     GS_CHECK(!sparse || !scene.blocks().defined(), "no block sleeps through a sparse step");
-    GS_CHECK(!observes() || statistics.size() == 3 || statistics.size() == 4,
-             "give max_radii, gradient_sums and views, or none of them");
+    GS_CHECK(!observes() || statistics.size() == 3, "give max_radii, gradient_sums and views, or none of them");
     GS_CHECK(!observes() || scene.dtype() == ScalarType::Float, "statistics are of float32 Gaussians, got float64");
     if (observes()) check_statistics(statistics[0], statistics[1], statistics[2], *radii, scene.count());
-    if (const MaybeTensor gradient = camera()) {
+    if (camera_gradient) {
       check_camera_gradients(scene);
-      check_tensor(*gradient, "the camera's gradient", ScalarType::Double, scene.device(),
+      check_tensor(*camera_gradient, "the camera's gradient", ScalarType::Double, scene.device(),
                    {baseline::kLensCameraNumbers});
-      GS_CHECK_VALUE(gradient->is_contiguous(), "the camera's gradient must be contiguous");
+      GS_CHECK_VALUE(camera_gradient->is_contiguous(), "the camera's gradient must be contiguous");
     }
     check_adam(scene);
   }
@@ -118,7 +118,7 @@ struct Step {
     out.guard = step_guard<T>(gaussians[0], entry(guard, 0), entry(guard, 1), iteration);
     if (now) out.now = reinterpret_cast<const gs::StepNow*>(read<int64_t>(*now));
     out.penalty = {T(constants[3]), T(constants[4])};
-    if (const MaybeTensor gradient = camera()) out.camera = write<double>(*gradient);
+    if (camera_gradient) out.camera = write<double>(*camera_gradient);
     if (!pixels.defined()) return out;
     out.observed = {pixels.numel(), nullptr, nullptr, nullptr, read<int32_t>(pixels), nullptr};
     if (!observes()) return out;
@@ -210,7 +210,7 @@ MaybeTensor wake_op(List<Tensor> gaussians, List<Tensor> camera, List<double> le
   const SceneTensors scene = scene_of(gaussians, camera, lens, options);
   const MaybeTensor none;
   const Step step{none,      averages, steps, {},        guard, attributes, rates,
-                  constants, columns,  false, iteration, now,   false};
+                  constants, columns,  false, iteration, now,   false,      none};
   GS_CHECK_VALUE(scene.raw() && !scene.has(kCov3d) && !scene.has(kColors), "blocks of raw Gaussians sleep");
   GS_CHECK_VALUE(sleep.size() == 3, "give awake, taken and terms");
   step.check_adam(scene);

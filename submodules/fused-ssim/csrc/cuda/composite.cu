@@ -1,9 +1,9 @@
 // Composites an image with alpha on a background. A thread takes a pixel.
 #include <cuda_runtime.h>
 
-#include "../backend.h"
-#include "../math/composite.h"
+#include "backend.h"
 #include "gs/cuda_launch.h"
+#include "math/composite.h"
 
 namespace gs {
 namespace {

@@ -5,9 +5,9 @@
 #include <vector>
 
 #include "backend.h"
+#include "cuda/ssim_tile.h"
 #include "emulated_queue.h"
 #include "gs/check.h"
-#include "ssim_tile.h"
 
 namespace {
 

@@ -1,8 +1,8 @@
 // The CUDA kernels on the CPU (submodules/common/emulation), under the sanitizers, against the CPU backend: the same
 // bits in any order of the threads.
 #include "backend.h"
-#include "box_tree.h"
 #include "clouds.h"
+#include "cuda/box_tree.h"
 #include "emulated_queue.h"
 #include "gs/check.h"
 

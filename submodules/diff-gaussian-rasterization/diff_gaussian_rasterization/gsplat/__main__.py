@@ -1,0 +1,3 @@
+from diff_gaussian_rasterization.gsplat.programs import run
+
+run()
