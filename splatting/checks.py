@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from arguments.features import FEATURES
 from groundwork.finding import Finding, Severity
 from groundwork.host.listing import some
 from scene.checks.conversion import already_undistorted
@@ -69,7 +70,7 @@ def faster_alone(ranks: int, on_gpu: bool, count: int) -> Finding | None:
 
 def without_effect(opt: argparse.Namespace, strategy: str) -> Finding | None:
     """What to say of given options that belong to another strategy."""
-    others = [option for name in strategies() if name != strategy for option in part_class(name).options.optimisation]
+    others = [option for name in strategies() if name != strategy for option in FEATURES[name].optimisation]
     given = [f"--{option.name}" for option in others if getattr(opt, option.name) != option.default]
     return Finding(f"--strategy {strategy} ignores {some(given)}") if given else None
 

@@ -1,10 +1,10 @@
 """The manual of parts: what a feature adds to a training, in one class, which lies in one file.
 
 A part is a subclass of `Part` in splatting/features/NAME.py, called by NAME in capital words (depth_tv: DepthTv), and a
-line in splatting/registry.py. The place of that line is the part's in the one order of all hooks. No other file names
-it. Hooks are optional; those that a class does not override cost nothing. This module and every NAME.py import nothing
-heavy, as doctor.py reads them where torch is missing: hooks import what they need. A long method lies in a second file
-beside it, NAME_*.py. Functions for commands and other parts are listed by `tools` of splatting/registry.py.
+line in splatting/registry.py. The place of that line is the part's in the one order of all hooks. Its options, if it
+has any, are an entry of arguments/features.py. No other file names it. Hooks are optional; those that a class does not
+override cost nothing. A long method lies in a second file beside it, NAME_*.py. Functions for commands and other parts
+are listed by `tools` of splatting/registry.py.
 
 A run (splatting/run.py), in the order in which it calls the hooks:
 
@@ -58,26 +58,10 @@ if TYPE_CHECKING:
     from scene.readers.info import CameraInfo, SceneInfo
     from scene.scene import Scene
     from splatting.iteration import Iteration, Losses, Term
-    from splatting.option import Option
     from splatting.run import Run
 
 Error: TypeAlias = BaseException | None
 Scored: TypeAlias = "tuple[ScoredViews | None, Sequence[Camera]]"  # how, None: as all others; and which views
-
-
-@dataclass(frozen=True)
-class Options:
-    """Options of a part, by the group that they belong to."""
-
-    model: "tuple[Option, ...]" = ()
-    pipeline: "tuple[Option, ...]" = ()
-    optimisation: "tuple[Option, ...]" = ()
-    launch: "tuple[Option, ...]" = ()
-
-    @property
-    def by_name(self) -> "dict[str, Option]":
-        """All of them."""
-        return {option.name: option for group in vars(self).values() for option in group}
 
 
 @dataclass(frozen=True)
@@ -103,8 +87,8 @@ class Needs:
 class Part:
     """Base of all parts.
 
-    name: of its module, the key of its state, and the option that brings it in by another value than its default.
-    options: that it declares.
+    name: of its module, the key of its state and of its options in arguments/features.py, and the option that brings it
+    in.
     active: whether it takes part; `begin` may clear it where a scene has no use for the part, which then has no hooks.
     by_state: whether its state in a checkpoint brings the part in where no option asks for it.
     needs: what it asks of the steps.
@@ -116,7 +100,6 @@ class Part:
     """
 
     name: ClassVar[str] = ""
-    options: ClassVar[Options] = Options()
     active = True
     by_state: ClassVar[bool] = False
     needs: ClassVar[Needs] = Needs()
@@ -128,8 +111,7 @@ class Part:
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
         """Whether the options ask for the part."""
-        option = cls.options.by_name[cls.name]
-        return getattr(given, option.name, option.default) != option.default
+        return bool(getattr(given, cls.name, False))
 
     @classmethod
     def asked_by(cls, given: argparse.Namespace) -> str:
@@ -236,7 +218,6 @@ class Strategy(Part):
 
     It joins a run once it is chosen, which may be late: `check` and `begin` are called then, when the model has its
     optimiser, and all hooks after them.
-    summary: of what it does, for the help.
     until: the option of the step at which it ends, and the part of the schedule that this is by default.
     removes: whether it removes Gaussians down to a given number.
     grows_to: whether it is meant to reach max_gaussians; not where nobody gives a number, with default_is_limit.
@@ -260,7 +241,6 @@ class Strategy(Part):
         rules that count steps take the iteration.
     """
 
-    summary: ClassVar[str] = ""
     until: ClassVar[tuple[str, float]] = "densify_until_iter", 1 / 2
     removes: ClassVar[bool] = False
     grows_to: ClassVar[bool] = True
@@ -349,11 +329,10 @@ class Strategy(Part):
 class Appearance(Part):
     """A part that trains how photos show renders (--appearance KIND), of which a training has one at most.
 
-    kind, summary: the value of the option, and what it does, for the help. flag: a further option that asks for it.
+    kind: the value of the option. flag: a further option that asks for it. arguments/features.py has both, too.
     """
 
     kind: ClassVar[str] = ""
-    summary: ClassVar[str] = ""
     flag: ClassVar[str] = ""
 
     @classmethod

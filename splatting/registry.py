@@ -4,13 +4,10 @@ import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import cache
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from groundwork.host.errors import UserError
 from splatting.part import Appearance, Part, Strategy
-
-if TYPE_CHECKING:
-    from splatting.option import Option
 
 # Names of modules, with the reason for the place, where there is one.
 PARTS = (
@@ -61,11 +58,6 @@ def in_order(parts: Iterable[Part]) -> list[Part]:
 def appearances() -> list[type[Appearance]]:
     """The parts that train how photos show renders (--appearance)."""
     return [kind for kind in map(part_class, PARTS) if issubclass(kind, Appearance)]
-
-
-def options_of(group: str) -> "list[Option]":
-    """What the parts declare of a group of options: model, pipeline, optimisation or launch."""
-    return [option for name in PARTS for option in getattr(part_class(name).options, group)]
 
 
 EXPOSURES = "exposures"  # the model's own key of what an appearance has trained

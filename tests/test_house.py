@@ -44,7 +44,7 @@ FLOORS = (
     ("scene.readers",),
     ("scene.colmap_loader", "scene.gaussians", "scene.images"),
     ("splatting.registry",),  # finds splatting.features by their names
-    ("splatting.option", "splatting.part"),
+    ("splatting.part",),
     ("utils",),
     ("groundwork.applications", "groundwork.finding"),
     ("groundwork.files",),

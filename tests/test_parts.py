@@ -13,8 +13,9 @@ import pytest
 from forks import fork
 from synthetic import make_colmap_scene
 
-from splatting.part import Part, fill, overrides
-from splatting.registry import PARTS, part_class, states_in, strategies, tools
+from arguments.features import FEATURES, appearances, strategies
+from splatting.part import Appearance, Part, Strategy, fill, overrides
+from splatting.registry import PARTS, part_class, states_in, tools
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -50,7 +51,7 @@ COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "exp
 
 
 def _options(name: str) -> set[str]:
-    return {*part_class(name).options.by_name}
+    return {*FEATURES[name].by_name} if name in FEATURES else set()
 
 
 def _own(name: str) -> list[Path]:
@@ -63,10 +64,10 @@ def _heirs(name: str) -> list[str]:
 
 
 def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: all but its own, its heirs' and the registry."""
+    """All Python files of the project that may not know a part: all but its own, its heirs' and the two tables."""
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py")), *(ROOT / f"{c}.py" for c in COMMANDS)]
-    registry = ROOT / "splatting" / "registry.py"
-    may = [registry, *(path for one in (name, *_heirs(name)) for path in _own(one))]
+    places = [ROOT / "splatting" / "registry.py", ROOT / "arguments" / "features.py"]
+    may = [*places, *(path for one in (name, *_heirs(name)) for path in _own(one))]
     yield from (path for path in found if path not in may)
 
 
@@ -102,11 +103,26 @@ def test_nobody_names_a_part_outside_of_its_files(name):
     assert [line for path in _files(name) for line in _names_of(name, path)] == []
 
 
-def test_what_declares_parts_imports_nothing_heavy():
-    """As doctor.py and convert.py read it where torch is missing."""
-    code = "import sys, splatting.registry as r; list(map(r.part_class, r.PARTS)); print(*sys.modules)"
+def test_options_import_nothing_heavy_and_no_part():
+    """As doctor.py reads them where torch is missing."""
+    code = "import sys, arguments.launch; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert not {"torch", "numpy", "scene", "arguments"} & {*done.stdout.split()}
+    assert not {"torch", "numpy", "scene", "splatting"} & {*done.stdout.split()}
+
+
+def test_parts_import_no_options_which_another_package_may_hide():
+    """As where other people's code with a package `arguments` of its own calls `Scene`."""
+    import_all = "import splatting.registry as r; list(map(r.part_class, r.PARTS))"
+    done = fork(f"import sys; sys.modules['arguments'] = None; {import_all}")
+    assert done.status == 0, done.stderr
+
+
+def test_the_table_of_options_has_parts_in_their_order_and_what_they_are():
+    kinds = {name: part_class(name) for name in FEATURES}
+    assert [*FEATURES] == [name for name in PARTS if name in FEATURES]
+    assert [*strategies()] == [name for name, kind in kinds.items() if issubclass(kind, Strategy)]
+    flags = {kind.kind: kind.flag for kind in kinds.values() if issubclass(kind, Appearance)}
+    assert {one.name: one.flag for one in appearances()} == flags
 
 
 def test_tools_are_functions_of_parts():
@@ -115,14 +131,16 @@ def test_tools_are_functions_of_parts():
         assert of and {*of} <= {*PARTS}, name
 
 
-# A program in which some parts are not there: neither their lines of the registry nor their files.
+# A program in which some parts are not there: neither their lines of the registry, their options nor their files.
 WITHOUT = """
 import sys
+from functools import partial
 from pathlib import Path
-import splatting.registry as registry
+sys.path.append("tests")
+from other_sources import PLACES, edit, without
 hidden, *words = sys.argv[1:]
 hidden = hidden.split(",")
-registry.PARTS = tuple(name for name in registry.PARTS if name not in hidden)
+edit(dict.fromkeys(PLACES, partial(without, hidden=hidden)))
 files = [path for name in hidden for path in Path("splatting/features").glob(f"{name}*.py")]
 sys.modules |= {f"splatting.features.{path.stem}": None for path in files}
 """

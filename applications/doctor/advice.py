@@ -17,6 +17,7 @@ import numpy as np
 
 from applications.doctor.model import load_scored
 from arguments import ModelParams, read_training_options
+from arguments.features import options_of
 from groundwork.files.json_files import write_json
 from groundwork.finding import Finding, note
 from groundwork.ranks.ranks import ranks
@@ -25,7 +26,7 @@ from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
-from splatting.registry import check_together, chosen, options_of, tools
+from splatting.registry import check_together, chosen, tools
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for

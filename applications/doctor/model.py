@@ -13,6 +13,7 @@ import torch
 from applications.doctor.changes import FITS as BAD_PSNR
 from applications.doctor.changes import LOST, recorded_psnr, what_changed
 from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
+from arguments.features import options_of
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.finding import Finding, fine, from_error
 from scene import Scene
@@ -26,7 +27,7 @@ from splatting.checks import LATE_RESET, check_overfitting
 from splatting.records.model_folder import closing_lines, curve_of
 from splatting.records.training_log import NAME as LOG
 from splatting.records.training_log import read_log
-from splatting.registry import options_of, tools
+from splatting.registry import tools
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 

@@ -14,6 +14,7 @@ from nerfbaselines import Method
 
 from applications.nerfbaselines.datasets import has_white_background, in_place_of_files, scene_of, view_of
 from arguments import write_cfg_args, write_model_json
+from arguments.features import FEATURES, appearances
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.files.json_files import read_json, write_json
 from scene.cameras import Camera
@@ -25,7 +26,7 @@ from splatting.iteration import Iteration
 from splatting.loop import training_steps
 from splatting.part import Part
 from splatting.records import training_log
-from splatting.registry import PARTS, appearances, part_class
+from splatting.registry import PARTS, part_class
 from splatting.run import Run
 from splatting.watch import MaskWatch
 from utils.system_utils import UserError, compute_device, saved_ply
@@ -41,7 +42,7 @@ _OF_FILES += tuple(part.name for part in _PARTS if part.needs.files)
 _FIXED = dict.fromkeys(
     ("advise", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "keep_unseen", "prune_sh",
-     *(name for part in _PARTS if part.told_last for name in part.options.by_name))
+     *(name for part in _PARTS if part.told_last for name in FEATURES[part.name].by_name))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true",
      "holdout": "every8"}  # fmt: skip

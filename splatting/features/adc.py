@@ -6,8 +6,7 @@ import sys
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option, above
-from splatting.part import Options, Strategy
+from splatting.part import Strategy
 
 if TYPE_CHECKING:
     from scene.gaussians.density_rules import Actions
@@ -22,17 +21,6 @@ class Adc(Strategy):
     """
 
     name = "adc"
-    summary = "adaptive density control of the 3DGS paper"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("absgrad", False, origin="ours",
-            help="adc: densify by absolute gradients of the pixels (AbsGS), which do not cancel out where a large "
-                 "Gaussian covers fine detail; --absgrad_threshold then replaces --densify_grad_threshold"),
-        Option("absgrad_threshold", 0.0008, origin="ours, as gsplat recommends", check=above(0),
-            help="adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with "
-                 "--absgrad; lower: more Gaussians"),
-    ))
-    # fmt: on
     fusable = True
     grows_to = False
 

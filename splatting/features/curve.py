@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option
-from splatting.part import Error, Options, Part
+from splatting.part import Error, Part
 
 if TYPE_CHECKING:
     import argparse
@@ -19,13 +18,6 @@ class Curve(Part):
     """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
 
     name = "curve"
-    # fmt: off
-    options = Options(launch=(
-        Option("no_curve", False, origin="ours", topic="output",
-            help="do not write error_vs_time.csv and .png; with --eval they cost up to 5 % of the time, more in short "
-                 "runs"),
-    ))
-    # fmt: on
     _recorder: Any = None
 
     @classmethod

@@ -2,8 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import CFG_ARGS, Option, at_least
-from splatting.part import Needs, Options, Part
+from splatting.part import Needs, Part
 
 if TYPE_CHECKING:
     import argparse
@@ -19,21 +18,6 @@ class Depths(Part):
     """Finds the maps of the training photos, and adds their loss for views whose map is reliable."""
 
     name = "depths"
-    # fmt: off
-    options = Options(
-        model=(
-            Option("depths", "", short="d", stored=CFG_ARGS, seen=False, topic="data",
-                help="folder of depth maps inside the scene folder, named like the photos: PNGs of inverse depth, or "
-                     "metric PNGs, .npy or .pfm; they stabilise regions that few photos show"),
-        ),
-        optimisation=(
-            Option("depth_l1_weight_init", 1.0, check=at_least(0), topic="data",
-                help="weight of the depth loss (--depths) at the start"),
-            Option("depth_l1_weight_final", 0.01, check=at_least(0), topic="data",
-                help="weight of the depth loss in the last step"),
-        ),
-    )
-    # fmt: on
     needs = Needs(depth=True, files=True)
 
     @classmethod

@@ -5,8 +5,7 @@ import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import CFG_ARGS, Option, at_least, within
-from splatting.part import Appearance, Options
+from splatting.part import Appearance
 
 if TYPE_CHECKING:
     from scene.cameras import Camera
@@ -24,27 +23,6 @@ class Exposure(Appearance):
     name = "exposure"
     kind = "affine"
     flag = "train_test_exp"
-    summary = "--train_test_exp"
-    # fmt: off
-    options = Options(
-        model=(
-            Option("train_test_exp", False, stored=CFG_ARGS, compared=False, after="white_background",
-                topic="photos that vary",
-                help="train a colour correction of each photo, for photos of different exposure; the left halves of "
-                     "test photos train too, and only their right halves are scored and rendered"),
-        ),
-        optimisation=(
-            Option("exposure_lr_init", 0.01, check=at_least(0), topic="photos that vary",
-                help="learning rate of exposures (--train_test_exp) at the start"),
-            Option("exposure_lr_final", 0.001, check=at_least(0), topic="photos that vary",
-                help="learning rate of exposures in the last step"),
-            Option("exposure_lr_delay_steps", 0, check=at_least(0), topic="photos that vary",
-                help="steps at the start over which the learning rate of exposures rises to its normal value"),
-            Option("exposure_lr_delay_mult", 0.0, check=within(0, 1), topic="photos that vary",
-                help="factor of the learning rate of exposures at step 0, where that rise begins"),
-        ),
-    )
-    # fmt: on
 
     def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
         from scene.dataset_readers import replaced_reader

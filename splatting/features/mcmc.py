@@ -9,21 +9,14 @@ what the view sees; and SH bands learn faster from many photos.
 from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option, at_least, within
-from splatting.part import Options, Strategy
+from splatting.part import Strategy
 
 if TYPE_CHECKING:
     from splatting.iteration import Iteration
 
-_PAPER = "ours, from the MCMC paper"
-_RELEASED = "ours, from the release of the MCMC paper"
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
 SECONDS = 0.25  # for each training photo, at least: 250 iterations on a GPU (docs/guide/strategies.md)
-
-
-def _between(value: float) -> str | None:
-    return None if 0 < value < 1 else "between 0 and 1, and neither of them"
 
 
 class Mcmc(Strategy):
@@ -33,34 +26,12 @@ class Mcmc(Strategy):
     """
 
     name = "mcmc"
-    summary = "moves transparent Gaussians to opaque ones and adds noise to positions"
     until = "mcmc_until_iter", 5 / 6
     fusable = True
     clamps = False
     default_is_limit = True
     queues = True
     seen_only = True
-    # fmt: off
-    options = Options(optimisation=(
-        Option("mcmc_until_iter", 25_000, origin=_RELEASED, check=at_least(0),
-            help="mcmc: relocation and growth end before this step; --densify_until_iter has no effect then"),
-        Option("mcmc_growth", 0.05, origin=_PAPER, check=within(0, 1),
-            help="mcmc: growth in every densification, as a part of the number of Gaussians"),
-        Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_between,
-            help="mcmc: a Gaussian of this opacity or less is moved to another one"),
-        Option("mcmc_noise", 500_000.0, origin=_PAPER, check=within(0, 1e9),
-            help="mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions"),
-        Option("mcmc_opacity_reg", 0.01, origin=_PAPER, check=at_least(0),
-            help="mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved"),
-        Option("mcmc_scale_reg", 0.01, origin=_PAPER, check=at_least(0),
-            help="mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians"),
-        Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_between,
-            help="mcmc: opacity of the Gaussians that are made from points"),
-        Option("mcmc_init_scale", 0.0, origin=_RELEASED, check=at_least(0),
-            help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their "
-                 "neighbours; 0: 0.1, or 1 in a given time"),
-    ))
-    # fmt: on
 
     @classmethod
     def best_in(cls, seconds: float, run: Any) -> bool:

@@ -28,10 +28,6 @@ class Ppisp(Appearance):
     """Trains the numbers of photos and of their cameras. Haze can grow before cameras after a reset of opacities."""
 
     name = kind = "ppisp"
-    summary = (
-        "exposure and white balance of each photo, vignetting and response of each camera, with the test photos held "
-        "out, and without resets of opacities at their usual interval"
-    )
     needs = Needs(captured=True, resets=False)
 
     def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:

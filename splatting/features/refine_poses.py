@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from groundwork.files.json_files import MODEL_JSON, read_json, write_json
+from groundwork.files.json_files import read_json, write_json
 from groundwork.finding import Finding, note
-from splatting.option import Option
-from splatting.part import Needs, Options, Part, Scored, fill
+from splatting.part import Needs, Part, Scored, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -29,13 +28,6 @@ class RefinePoses(Part):
     """Gives the cameras their poses, which take steps on the host, and keeps them in poses.json."""
 
     name = "refine_poses"
-    # fmt: off
-    options = Options(model=(
-        Option("refine_poses", False, origin="ours", stored=MODEL_JSON, topic="cameras",
-            help="correct the pose of each training camera together with the Gaussians, by at most 3 degrees; needs "
-                 "the tracks of a COLMAP scene"),
-    ))
-    # fmt: on
     needs = Needs(files=True)
     against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
 

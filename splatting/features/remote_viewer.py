@@ -3,8 +3,7 @@
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option
-from splatting.part import Error, Options, Part
+from splatting.part import Error, Part
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -25,13 +24,6 @@ class RemoteViewer(Part):
     """
 
     name = "remote_viewer"
-    # fmt: off
-    options = Options(launch=(
-        Option("ip", "127.0.0.1", help="address to listen at for the remote viewer", topic="viewers"),
-        Option("port", 6009, help="port for the remote viewer, 0: any free one", topic="viewers"),
-        Option("disable_viewer", False, called=True, help="open no port for the remote viewer", topic="viewers"),
-    ))
-    # fmt: on
     told_last = True
     _asked = False
 
@@ -50,7 +42,9 @@ class RemoteViewer(Part):
 
         self._run, self._gui = run, network_gui
         if not run.launch.disable_viewer:
-            ip, port = self.options.launch[:2]
+            from arguments.features import FEATURES
+
+            ip, port = FEATURES[self.name].launch[:2]
             address = run.launch.ip, run.launch.port
             run.resources.enter_context(self._gui.listening(*address, address != (ip.default, port.default)))
 

@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from groundwork.files.json_files import MODEL_JSON, read_model_json
-from splatting.option import MOST_NEEDED, Option
-from splatting.part import Error, Options, Part, fill
+from splatting.part import Error, Part, fill
 from splatting.registry import PARTS, part_class
 from splatting.schedule import STEADY
 from utils.system_utils import UserError
@@ -42,15 +41,6 @@ class Resume(Part):
 
     name = "resume"
     told_last = True  # after the checkpoints that were asked for
-    # fmt: off
-    options = Options(launch=(
-        Option("resume", False, origin="ours", topic=MOST_NEEDED,
-            help="resume in -m, or start there, and write checkpoints for the next --resume"),
-        Option("no_last_checkpoint", False, origin="ours", called=True, topic="output",
-            help="leave no checkpoint at the end. It has 720 MB for a million Gaussians, and --resume continues it "
-                 "with more --iterations or seconds"),
-    ))
-    # fmt: on
 
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:

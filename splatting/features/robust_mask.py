@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from groundwork.finding import Finding, note
-from splatting.option import Option, within
-from splatting.part import Error, Needs, Options, Part, fill
+from splatting.part import Error, Needs, Part, fill
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,13 +23,6 @@ class RobustMask(Part):
     """
 
     name = "robust_mask"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5), topic="photos that vary",
-            help="largest part of a photo that training may ignore because the other photos do not show it, as with "
-                 "passers-by; 0: off"),
-    ))
-    # fmt: on
     needs = Needs(ranks=False)
 
     def begin(self, run: Any, state: Any) -> None:

@@ -1,11 +1,11 @@
 """A sky behind all points (--sky): Gaussians on a far sphere that stay there."""
 
+import argparse
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from groundwork.finding import Finding, note
-from splatting.option import Option, one_of
-from splatting.part import Needs, Options, Part, fill
+from splatting.part import Needs, Part, fill
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,17 +19,14 @@ class Sky(Part):
     """Adds the sky's Gaussians at the start, holds them on their sphere, and asks that nothing stays before them."""
 
     name = "sky"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("sky", "off", origin="ours", check=one_of("off", "auto"), topic="quality and speed",
-            help="auto: add Gaussians on a far sphere in directions that photos show and that have no points; "
-                 "off: add none. Trains in one process, with --strategy adc or budget"),
-    ))
-    # fmt: on
     by_state = True
     needs = Needs(depth=True, ranks=False)
     against = {"strategy=mcmc": "which relocates large Gaussians; use adc or budget"}
     shell = None
+
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        return getattr(given, "sky", "off") != "off"
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.features import sky_shell as shell

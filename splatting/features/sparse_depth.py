@@ -5,8 +5,7 @@ Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option, at_least
-from splatting.part import Needs, Options, Part
+from splatting.part import Needs, Part
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -19,12 +18,6 @@ class SparseDepth(Part):
     """Adds the depth of a view's points to its loss."""
 
     name = "sparse_depth"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("sparse_depth", 0.0, origin="ours", check=at_least(0), topic="data",
-            help="weight of the loss of depth at the scene's own points (COLMAP only); 0: off"),
-    ))
-    # fmt: on
     needs = Needs(depth=True, ranks=False, files=True)
 
     def begin(self, run: Any, state: Any) -> None:

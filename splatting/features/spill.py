@@ -6,8 +6,7 @@ the part gives the model its room in `check`, while the model is empty, not in `
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option, within
-from splatting.part import Error, Options, Part, fill
+from splatting.part import Error, Part, fill
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -27,13 +26,6 @@ class Spill(Part):
     """
 
     name = "spill"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
-            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
-                 "not fit are kept in the host's memory; slower, with the same result"),
-    ))
-    # fmt: on
 
     @classmethod
     def wanted(cls, given: "argparse.Namespace") -> bool:

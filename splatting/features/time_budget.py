@@ -4,8 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from groundwork.files.json_files import SCHEDULE
-from splatting.option import MOST_NEEDED, Option, within
-from splatting.part import Options, Part, fill
+from splatting.part import Part, fill
 
 if TYPE_CHECKING:
     import argparse
@@ -26,19 +25,6 @@ class TimeBudget(Part):
     """
 
     name = "time_budget"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("time_budget", 0.0, origin="ours", compared=False, topic=MOST_NEEDED,
-            above_zero=True, unset="none", check=within(0, 31_536_000),  # a year
-            help="seconds to train, without scores and saves, or more if a finished run is resumed. "
-                 "The schedule of --iterations is fitted into them, with 25 to 50 Gaussians for each "
-                 "iteration. --strategy auto then means budget, or mcmc for at most 50 photos on a GPU with 0.25 "
-                 "s or more for each"),
-        Option("schedule", "", origin="ours", compared=False, topic="quality and speed",
-            help="schedule.json of a run with --time_budget: repeat its schedule, independent of the clock. Or a "
-                 "number: fit the whole schedule of --iterations into this many iterations"),
-    ))
-    # fmt: on
     _iteration = 0  # of a run; a scene without one saves no schedule
     ends_by = {"time_budget": True, "schedule": False}
 

@@ -2,8 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from splatting.option import Option, at_least
-from splatting.part import Error, Options, Part
+from splatting.part import Error, Part
 
 if TYPE_CHECKING:
     from splatting.iteration import Iteration, Losses, Term
@@ -12,13 +11,7 @@ if TYPE_CHECKING:
 class Grey(Part):
     """Draws renders towards grey: adds the weighted mean spread of a pixel's three channels to the loss."""
 
-    name = "grey"  # of the folder, of the state in a checkpoint, and of the option that brings the part in
-    # fmt: off
-    options = Options(optimisation=(
-        Option("grey", 0.0, origin="ours", check=at_least(0),
-            help="weight of the spread of colours in renders, which draws them towards grey; 0: off"),
-    ))
-    # fmt: on
+    name = "grey"  # of the file, of the state in a checkpoint, and of the option that brings the part in
 
     def begin(self, run: Any, state: Any) -> None:
         from splatting.objective import LossWatch

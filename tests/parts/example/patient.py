@@ -3,23 +3,13 @@
 from typing import Any
 
 from splatting.features.adc import Adc
-from splatting.option import Option, at_least
-from splatting.part import Options
 
 
 class Patient(Adc):
     """Adaptive density control of Gaussians whose mean gradient was large in several densifications in a row."""
 
     name = "patient"
-    summary = "as adc, but Gaussians grow only after --patience densifications in a row with a large gradient"
     fusable = True  # it needs no gradient besides the statistics; not inherited
-    # fmt: off
-    options = Options(optimisation=(
-        Option("patience", 2, origin="ours", check=at_least(1),
-            help="patient: densifications in a row in which a Gaussian's gradient reaches densify_grad_threshold "
-                 "before it is cloned or split; 1: as adc"),
-    ))
-    # fmt: on
 
     @classmethod
     def takes_absolute(cls, opt: Any) -> bool:
