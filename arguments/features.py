@@ -32,7 +32,7 @@ class Options:
 
     @property
     def by_name(self) -> dict[str, Option]:
-        """All of them."""
+        """Return all options of the feature by their names."""
         return {option.name: option for option in (*self.model, *self.optimisation, *self.launch)}
 
 
@@ -52,7 +52,7 @@ _PAPER = "ours, from the MCMC paper"
 _RELEASED = "ours, from the release of the MCMC paper"
 
 # fmt: off
-FEATURES = {
+FEATURES: dict[str, Options] = {
     "time_budget": Options(optimisation=(
         Option("time_budget", 0.0, origin="ours", compared=False, topic=MOST_NEEDED,
             above_zero=True, unset="none", check=within(0, 31_536_000),  # a year

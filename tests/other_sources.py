@@ -21,13 +21,17 @@ def edit(sources: dict[str, Callable[[str], str]]) -> None:
 
 
 class _Without(ast.NodeTransformer):
-    """Removes parts: their items of tuples, and their entries of tables."""
+    """Removes parts: their imports, their items of tuples, and their entries of tables."""
 
     def __init__(self, hidden: Collection[str]) -> None:
         self._hidden = hidden
+        self._classes = {"".join(map(str.capitalize, name.split("_"))) for name in hidden}
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.ImportFrom | None:
+        return None if node.module.rpartition(".")[2] in self._hidden else node
 
     def visit_Tuple(self, node: ast.Tuple) -> ast.Tuple:
-        node.elts = [item for item in node.elts if not (isinstance(item, ast.Constant) and item.value in self._hidden)]
+        node.elts = [item for item in node.elts if getattr(item, "id", "") not in self._classes]
         return node
 
     def visit_Dict(self, node: ast.Dict) -> ast.Dict:

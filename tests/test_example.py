@@ -11,21 +11,25 @@ import torch
 from forks import Done, fork
 
 ROOT = Path(__file__).resolve().parents[1]
-WITH_EXAMPLE = """
+WITH_EXAMPLE = '''
 import sys
 from pathlib import Path
 sys.path.append("tests")
 from other_sources import edit
-edit({"arguments.features": lambda source: source + Path("tests/parts/example/options.py").read_text()})
 import splatting.features
-import splatting.registry as registry
 splatting.features.__path__.append("tests/parts/example")
-registry.PARTS = (*registry.PARTS, "patient", "grey")
+registered = """
+from splatting.features.grey import Grey
+from splatting.features.patient import Patient
+PARTS = (*PARTS, Patient, Grey)
+"""
+options = Path("tests/parts/example/options.py").read_text()
+edit({"arguments.features": lambda source: source + options, "splatting.registry": lambda source: source + registered})
 import train
 scene, *words = sys.argv[1:]
 options = ["-s", scene, "-r", "48", "--iterations", "40", "--disable_viewer", "--no_curve", "--test_iterations", "-1"]
 train.main([*options, *words])
-"""
+'''
 
 
 def _train(scene: Path, *words: object) -> Done:
@@ -99,10 +103,10 @@ def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
     with open(tmp_path / "arguments/features.py", "a", encoding="utf-8") as table:
         table.write((ROOT / "tests/parts/example/options.py").read_text(encoding="utf-8"))
     registry = tmp_path / "splatting/registry.py"
-    registry.write_text(
-        registry.read_text().replace('    "sparse_depth",', '    "grey",\n    "patient",\n    "sparse_depth",')
-    )
-    rules = "nobody_names and (adc or grey or patient) or hidden1 or tools"
+    text = registry.read_text(encoding="utf-8").replace("    SparseDepth,", "    Grey,\n    Patient,\n    SparseDepth,")
+    imports = "".join(f"from splatting.features.{name} import {name.capitalize()}\n" for name in ("grey", "patient"))
+    registry.write_text(text.replace("from splatting.features.mcmc", f"{imports}from splatting.features.mcmc"))
+    rules = "nobody_names and (adc or grey or patient) or hidden1"
     command = [
         sys.executable,
         "-m",

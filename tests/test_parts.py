@@ -15,7 +15,7 @@ from synthetic import make_colmap_scene
 
 from arguments.features import FEATURES, appearances, strategies
 from splatting.part import Appearance, Part, Strategy, fill, overrides
-from splatting.registry import PARTS, part_class, states_in, tools
+from splatting.registry import PARTS, states_in
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,6 +25,8 @@ NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  #
 EVALUATION = "applications/evaluation/command.py"
 KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
     ("time_budget", "applications/nerfbaselines/spec.py"),  # a set of options, as a user gives it
+    ("refine_poses", "scene/checks/fit.py"),  # remedies
+    ("schedule", "splatting/checks.py"),
     ("no_curve", "applications/nerfbaselines/method.py"),
     ("no_curve", "applications/doctor/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
@@ -47,6 +49,8 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ),
     ("disable_viewer", "applications/nerfbaselines/method.py"),
 }
+CLASSES = {part.name: part for part in PARTS}
+NAMES = [*CLASSES]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
 
 
@@ -60,7 +64,7 @@ def _own(name: str) -> list[Path]:
 
 def _heirs(name: str) -> list[str]:
     """The parts that inherit from a part, as strategies may."""
-    return [other for other in PARTS if other != name and issubclass(part_class(other), part_class(name))]
+    return [other for other in NAMES if other != name and issubclass(CLASSES[other], CLASSES[name])]
 
 
 def _files(name: str) -> Iterator[Path]:
@@ -98,7 +102,7 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
             yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its files"
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", NAMES)
 def test_nobody_names_a_part_outside_of_its_files(name):
     assert [line for path in _files(name) for line in _names_of(name, path)] == []
 
@@ -112,23 +116,15 @@ def test_options_import_nothing_heavy_and_no_part():
 
 def test_parts_import_no_options_which_another_package_may_hide():
     """As where other people's code with a package `arguments` of its own calls `Scene`."""
-    import_all = "import splatting.registry as r; list(map(r.part_class, r.PARTS))"
-    done = fork(f"import sys; sys.modules['arguments'] = None; {import_all}")
+    done = fork("import sys; sys.modules['arguments'] = None; import splatting.registry")
     assert done.status == 0, done.stderr
 
 
 def test_the_table_of_options_has_parts_in_their_order_and_what_they_are():
-    kinds = {name: part_class(name) for name in FEATURES}
-    assert [*FEATURES] == [name for name in PARTS if name in FEATURES]
-    assert [*strategies()] == [name for name, kind in kinds.items() if issubclass(kind, Strategy)]
-    flags = {kind.kind: kind.flag for kind in kinds.values() if issubclass(kind, Appearance)}
+    assert [*FEATURES] == [name for name in NAMES if name in FEATURES]
+    assert [*strategies()] == [part.name for part in PARTS if issubclass(part, Strategy)]
+    flags = {part.kind: part.flag for part in PARTS if issubclass(part, Appearance)}
     assert {one.name: one.flag for one in appearances()} == flags
-
-
-def test_tools_are_functions_of_parts():
-    for name in re.findall(r"\b(\w+)\(", tools.__doc__):
-        of = [tool.__module__.split(".")[-1] for tool in tools(name)]
-        assert of and {*of} <= {*PARTS}, name
 
 
 # A program in which some parts are not there: neither their lines of the registry, their options nor their files.
@@ -164,9 +160,9 @@ def _halves() -> list[list[str]]:
 
     What inherits from a part goes with it.
     """
-    digits = range((len(PARTS) - 1).bit_length())
-    halves = [{name for n, name in enumerate(PARTS) if n >> digit & 1 == bit} for digit in digits for bit in (0, 1)]
-    return [[name for name in PARTS if name in half or any(name in _heirs(one) for one in half)] for half in halves]
+    digits = range((len(NAMES) - 1).bit_length())
+    halves = [{name for n, name in enumerate(NAMES) if n >> digit & 1 == bit} for digit in digits for bit in (0, 1)]
+    return [[name for name in NAMES if name in half or any(name in _heirs(one) for one in half)] for half in halves]
 
 
 @pytest.mark.parametrize("hidden", _halves())
@@ -174,7 +170,7 @@ def test_without_half_of_the_parts_all_else_imports_and_lacks_their_options_alon
     done = fork(WITHOUT + IMPORTED, ",".join(hidden), *ROOMS, *(f"{command}.py" for command in COMMANDS))
     assert done.status == 0, done.stderr
     there, gone = {*done.stdout.split()}, {option for name in hidden for option in _options(name)}
-    assert not there & gone and {option for name in PARTS for option in _options(name)} - gone <= there
+    assert not there & gone and {option for name in NAMES for option in _options(name)} - gone <= there
 
 
 TRAINED = """

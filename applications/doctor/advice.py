@@ -26,7 +26,7 @@ from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
-from splatting.registry import check_together, chosen, tools
+from splatting.registry import PARTS, check_together, chosen
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for
@@ -56,8 +56,8 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     if any(tracks):
         yield from _of_tracks(scene, tracks)
-    for advise_part in tools("advise"):
-        yield from advise_part(scene, tracks)
+    for part in PARTS:
+        yield from part.advise(scene, tracks)
     if trains:
         yield from _of_short_training(dataset)
 
@@ -186,5 +186,5 @@ def _of_short_training(dataset: argparse.Namespace) -> Iterator[Finding]:
         print(f"{_ITERATIONS:,} iterations on photos of {_WIDTH} pixels show what the records do not", flush=True)
         _trained([sys.executable, str(ROOT / "train.py"), *map(str, own), *_data_words(dataset)])
         scene, views = load_scored(folder)
-        for advise_part in tools("advise_trained"):
-            yield from advise_part(scene, views)
+        for part in PARTS:
+            yield from part.advise_trained(scene, views)

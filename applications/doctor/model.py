@@ -27,7 +27,7 @@ from splatting.checks import LATE_RESET, check_overfitting
 from splatting.records.model_folder import closing_lines, curve_of
 from splatting.records.training_log import NAME as LOG
 from splatting.records.training_log import read_log
-from splatting.registry import tools
+from splatting.registry import PARTS
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
@@ -130,8 +130,9 @@ def _not_finite(gaussians: GaussianModel) -> Iterator[Finding]:
 
 def _notes(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
     """What parts of a training say of a trained model."""
-    for examine in tools("examine"):
-        yield from examine(scene, _scored(scene, options))
+    views = _scored(scene, options)
+    for part in PARTS:
+        yield from part.examine(scene, views)
 
 
 def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:

@@ -27,8 +27,7 @@ from groundwork.host.machine import one_line
 from scene.readers.info import from_above, up_of
 from splatting.records.figures import draw_cameras, draw_curves, draw_poses, draw_sizes
 from splatting.records.model_folder import json_or_none
-from splatting.records.renders import GAIN, ComparedViews
-from splatting.registry import tools
+from splatting.records.renders import GAIN, MASK_PICTURE, ComparedViews
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
@@ -125,7 +124,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             "curves": _figures(draw_curves, folder, scene, members, peers),
             "poses": _figures(draw_poses, folder, scene, members),
             "sizes": _figures(draw_sizes, folder, scene, members),
-            "masked": [path for run in members for path in _of_parts(output / run["model"])],
+            "masked": [path for run in members if (path := output / run["model"] / MASK_PICTURE).is_file()],
             "views": _views(output, scene, members, each),
         }
     texts = {f"report.{kind}": render(kind, report, pictures, output) for kind in ("md", "html")}
@@ -151,11 +150,6 @@ def _from_above(output: Path, runs: Sequence[Run]) -> dict[str, list[np.ndarray]
         if run["split"] and count is not None:
             found.setdefault(run["split"], np.split(flat, [len(flat) - count]))
     return found
-
-
-def _of_parts(model: Path) -> list[Path]:
-    """Pictures of a model folder that parts of its training have drawn."""
-    return [path for pictures in tools("pictures") for path in pictures(model) if path.is_file()]
 
 
 def _figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:

@@ -1,17 +1,21 @@
 """Depth maps as supervision (--depths), as in the newest reference: a loss of inverse depth with a falling weight."""
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from pathlib import Path
+from typing import Any
 
+from torch import Tensor
+
+from scene.cameras import Camera
+from scene.dataset_readers import replaced_reader
+from scene.readers.depth_maps import with_depth_maps
+from scene.readers.depth_scale import check_maps
+from scene.readers.info import SceneInfo
+from scene.readers.scene_folder import kind_of
+from splatting.iteration import Iteration, Term
 from splatting.part import Needs, Part
-
-if TYPE_CHECKING:
-    import argparse
-
-    from torch import Tensor
-
-    from scene.cameras import Camera
-    from scene.readers.info import SceneInfo
-    from splatting.iteration import Iteration, Term
+from utils.general_utils import get_expon_lr_func
+from utils.loss_utils import inverse_depth_loss
 
 
 class Depths(Part):
@@ -21,17 +25,10 @@ class Depths(Part):
     needs = Needs(depth=True, files=True)
 
     @classmethod
-    def follows_length(cls, given: "argparse.Namespace") -> bool:
+    def follows_length(cls, given: argparse.Namespace) -> bool:
         return cls.wanted(given)
 
-    def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
-        from pathlib import Path
-
-        from scene.dataset_readers import replaced_reader
-        from scene.readers.depth_maps import with_depth_maps
-        from scene.readers.depth_scale import check_maps
-        from scene.readers.scene_folder import kind_of
-
+    def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         if not fresh or replaced_reader(kind_of(args.source_path)):  # which finds the maps itself
             return info
         info = with_depth_maps(info, Path(args.source_path), args.depths)
@@ -39,27 +36,23 @@ class Depths(Part):
         return info
 
     def begin(self, run: Any, state: Any) -> None:
-        from utils.general_utils import get_expon_lr_func
-
         self._schedule, opt = run.schedule, run.opt
         self._unit = 1 / run.gaussians.enlargement  # so that the loss is that of depths as they are drawn
         ends = opt.depth_l1_weight_init, opt.depth_l1_weight_final
         self._weight = get_expon_lr_func(*ends, max_steps=opt.iterations)
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
+    def terms(self, at: Iteration) -> dict[str, Term]:
         weight = self._weight(self._schedule.schedule_step(at.iteration)) if at.camera.depth_reliable else 0.0
         if not weight > 0:
             return {}
         return {"depth": lambda package, mask: weight * self._unit * depth_loss(package["depth"], at.camera, mask)}
 
 
-def depth_loss(inverse_depth: "Tensor", camera: "Camera", mask: "Tensor | None") -> "Tensor":
+def depth_loss(inverse_depth: Tensor, camera: Camera, mask: Tensor | None) -> Tensor:
     """Mean |difference| of an inverse depth (1, H, W) from the camera's map, where the map has a value.
 
     mask: (1, H, W) bool, pixels that count; None: all.
     """
-    from utils.loss_utils import inverse_depth_loss
-
     target = camera.target_inverse_depth
     if camera.depth_has_gaps:
         mask = target > 0 if mask is None else mask & (target > 0)

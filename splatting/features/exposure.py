@@ -3,14 +3,15 @@
 import argparse
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from scene.cameras import Camera
+from scene.dataset_readers import replaced_reader
+from scene.readers.info import CameraInfo, SceneInfo, names_of_photos, normalization
+from scene.readers.scene_folder import kind_of
+from scene.scene import Scene, load_exposures, save_exposures
 from splatting.part import Appearance
-
-if TYPE_CHECKING:
-    from scene.cameras import Camera
-    from scene.readers.info import CameraInfo, SceneInfo
-    from scene.scene import Scene
+from utils.image_utils import half
 
 
 class Exposure(Appearance):
@@ -24,17 +25,11 @@ class Exposure(Appearance):
     kind = "affine"
     flag = "train_test_exp"
 
-    def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
-        from scene.dataset_readers import replaced_reader
-        from scene.readers.scene_folder import kind_of
-
+    def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         by_other_code = replaced_reader(kind_of(args.source_path))  # which gets the option as an argument
         return info if by_other_code else train_on_all(info)
 
-    def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
-        from scene.readers.info import names_of_photos
-        from utils.image_utils import half
-
+    def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
         scene.halves = True
         names, tested = names_of_photos(scene.info), {view.image_path for view in scene.info.test_cameras}
         for camera, view in cameras:
@@ -48,21 +43,15 @@ class Exposure(Appearance):
         if run.start and state is None:
             print(f"{run.start} has no exposures; all photos start without a correction")
 
-    def save(self, scene: "Scene") -> None:
-        from scene.scene import save_exposures
-
+    def save(self, scene: Scene) -> None:
         save_exposures(scene.gaussians, scene.model_path)
 
-    def load(self, scene: "Scene", args: argparse.Namespace) -> None:
-        from scene.scene import load_exposures
-
+    def load(self, scene: Scene, args: argparse.Namespace) -> None:
         load_exposures(scene)
 
 
-def train_on_all(info: "SceneInfo") -> "SceneInfo":
+def train_on_all(info: SceneInfo) -> SceneInfo:
     """The scene with its test views among the training views, too: sorted by name, or appended if names clash."""
-    from scene.readers.info import normalization
-
     views = info.train_cameras + info.test_cameras
     if len({view.image_name for view in views}) == len(views):
         views.sort(key=lambda view: os.fsencode(view.image_name))

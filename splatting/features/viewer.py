@@ -1,14 +1,12 @@
 """A web page that shows the training and controls it (--viewer)."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from groundwork.applications import application
+from splatting.iteration import Iteration
 from splatting.part import Error, Needs, Part
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    from splatting.iteration import Iteration
 
 
 class Viewer(Part):
@@ -31,10 +29,10 @@ class Viewer(Part):
         self._page = application("viewer", "training_page").TrainingPage(run)
         run.resources.callback(self._page.close)
 
-    def due(self, at: "Iteration") -> bool:
+    def due(self, at: Iteration) -> bool:
         return self._page.due(at)
 
-    def stepped(self, at: "Iteration") -> None:
+    def stepped(self, at: Iteration) -> None:
         self._page.stepped(at)
 
     def ended(self, error: Error) -> None:

@@ -2,6 +2,9 @@
 
 from typing import Any
 
+import torch
+
+from scene.gaussians.density_rules import mean_gradient
 from splatting.features.adc import Adc
 
 
@@ -16,8 +19,6 @@ class Patient(Adc):
         return False  # --absgrad is of adc alone
 
     def begin(self, run: Any, state: Any) -> None:
-        import torch
-
         super().begin(run, state)
         self._patience = run.opt.patience
         self._model = model = run.gaussians
@@ -26,10 +27,6 @@ class Patient(Adc):
         model.columns[self.name] = started.to(model.get_xyz.device)
 
     def densify(self, iteration: int, limit_size: bool) -> None:
-        import torch
-
-        from scene.gaussians.density_rules import mean_gradient
-
         model = self._model
         large = mean_gradient(model.xyz_gradient_accum, model.denom) >= self.threshold
         streaks = model.columns[self.name] = torch.where(large, model.columns[self.name] + 1, 0)
