@@ -4,10 +4,10 @@ import argparse
 import os
 from collections.abc import Collection
 
+from arguments.features import appearances, options_of, strategies
+from arguments.option import CFG_ARGS, MOST_NEEDED, Option, above, at_least, in_places, one_of, within
 from arguments.param_group import GroupParams, OptionTable
 from groundwork.files.json_files import MODEL_JSON
-from splatting.option import CFG_ARGS, MOST_NEEDED, Option, above, at_least, in_places, one_of, within
-from splatting.registry import appearances, options_of, part_class, strategies
 from utils.system_utils import UserError
 
 
@@ -73,10 +73,10 @@ class ModelParams(OptionTable):
             help="photos of distorting lenses. native: train on the photos as they are, if the rasterizer knows the "
                  "camera model; undistort: resample them to pinhole images when they are loaded; auto: native; a "
                  "resumed training keeps what it began with, and code that does not use train.py undistorts"),
-        Option("appearance", "none", origin="ours", check=one_of("none", *(one.kind for one in appearances())),
+        Option("appearance", "none", origin="ours", check=one_of("none", *(one.name for one in appearances())),
             stored=MODEL_JSON, topic="photos that vary",
             help="model of exposure, for photos that differ in brightness or colour. "
-                 + "; ".join(f"{a.kind}: {a.summary}" for a in appearances())
+                 + "; ".join(f"{a.name}: {a.summary}" for a in appearances())
                  + "; exports and viewers do not show it"),
         Option("images_to_load", 0, origin="ours", check=at_least(0), topic="memory",
             help="largest number of decoded images (photos, masks and depth maps) in memory, 0: all. The others are "
@@ -95,7 +95,7 @@ class ModelParams(OptionTable):
         if len(starts) > 1:
             raise UserError(f"{' and '.join(starts[:2])} both name the points to start from; leave one out")
         for appearance in filter(lambda one: one.flag, appearances()):
-            kind, flag, named = appearance.kind, appearance.flag, getattr(values, "appearance", "none")
+            kind, flag, named = appearance.name, appearance.flag, getattr(values, "appearance", "none")
             if named == kind:
                 setattr(values, flag, True)
             elif named != "none" and getattr(values, flag, False):
@@ -188,7 +188,7 @@ class OptimizationParams(OptionTable):
         Option("strategy", "auto", origin="ours", check=one_of("auto", *strategies()), stored=MODEL_JSON,
             topic=MOST_NEEDED,
             help="how Gaussians are added, moved and removed. auto: adc, or the best strategy for a given time; a "
-                 "resumed run keeps its own. " + "; ".join(f"{n}: {part_class(n).summary}" for n in strategies())),
+                 "resumed run keeps its own. " + "; ".join(f"{name}: {about}" for name, about in strategies().items())),
     )
     # fmt: on
 

@@ -4,9 +4,9 @@ import argparse
 from typing import Any
 
 from arguments import ModelParams, OptimizationParams, PipelineParams, TopicParser
+from arguments.features import options_of
+from arguments.option import MOST_NEEDED
 from arguments.param_group import OptionTable
-from splatting.option import MOST_NEEDED
-from splatting.registry import options_of
 
 
 def training_parser() -> tuple[TopicParser, tuple[OptionTable, ...]]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection
 from typing import Any, ClassVar, NoReturn
 
-from splatting.option import Option
+from arguments.option import Option
 
 _FOLDERS = {"-s": "scene", "-m": "model", "--scenes": "scene"}
 _OF_WINDOWS = re.compile(r"([A-Za-z]):([\\/]\S.*|[\w.-]+)")  # a shell may have taken backslashes away

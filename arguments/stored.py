@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from arguments.groups import OPTIONS, ModelParams
+from arguments.option import CFG_ARGS, Value
 from groundwork.files import json_files
 from groundwork.files.json_files import ENLARGEMENT, MODEL_JSON, OFFSET
 from groundwork.files.plain_files import plain_text
 from groundwork.host.machine import VERSION
-from splatting.option import CFG_ARGS, Value
 from utils.system_utils import UserError, atomic_write
 
 _IN_CFG_ARGS = {option.name: option.default for option in OPTIONS if option.stored == CFG_ARGS}

@@ -3,8 +3,8 @@
 import argparse
 from typing import Any
 
+from arguments.option import MOST_NEEDED, NUMBERS, TOPICS
 from arguments.param_group import OptionParser
-from splatting.option import MOST_NEEDED, NUMBERS, TOPICS
 
 
 class _HelpAll(argparse.Action):
@@ -15,7 +15,7 @@ class _HelpAll(argparse.Action):
 
 
 class TopicParser(OptionParser):
-    """A parser whose help has the topics of options (splatting/option.py) as groups."""
+    """A parser whose help has the topics of options (arguments/option.py) as groups."""
 
     lists_all = "--help-all"
     shows_all = False

@@ -45,7 +45,7 @@ def options_page(root: Path) -> str:
     """The options of train.py by topic, from its parser, which needs none of train.py's packages."""
     sys.path.insert(0, str(root))
     from arguments.launch import training_parser
-    from splatting.option import TOPICS
+    from arguments.option import TOPICS
 
     lines = ["# Options of train.py", "", "`train.py -h` lists the first group, and `train.py --help-all` all groups."]
     for topic, actions in training_parser()[0].by_topic().items():

@@ -13,8 +13,7 @@ from scene.gaussians.checkpoint import extra_state, load_checkpoint, unpack
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.morton import sort_scattered
 from scene.gaussians.ply import read_ply
-from scene.scene import Scene
-from splatting.registry import states_in
+from scene.scene import Scene, registry_of_parts
 from utils.system_utils import UserError, saved_iterations, saved_ply
 
 _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth")
@@ -50,7 +49,8 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
         capture, _ = load_checkpoint(path)
         degree = _degree(capture[3].shape[1])  # of f_rest
         gaussians = GaussianModel(degree if sh_degree is None else sh_degree)
-        states_in(extra_state(capture))  # UserError for a part that is gone: it may have changed what is drawn
+        # UserError for a part that is gone: it may have changed what is drawn.
+        registry_of_parts().states_in(extra_state(capture))
         rows = unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows
     else:
         rows = read_ply(path, sh_degree)

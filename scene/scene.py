@@ -6,8 +6,10 @@ import os
 import random
 import shutil
 from collections.abc import Iterable, Sequence
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
@@ -24,8 +26,6 @@ from scene.readers.info import CameraInfo, SceneInfo, photo_size
 from scene.readers.point_cloud import write_point_cloud
 from scene.readers.scene_folder import kind_of
 from scene.readers.tracks import enlargement
-from splatting.part import Part
-from splatting.registry import chosen
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError, atomic_write, find_iteration, saved_ply
 
@@ -55,9 +55,9 @@ class Scene:
     this to the caller. shuffle: mix the order of the views (always the same way). resolution_scales: factors by which
     views are made smaller, one list of cameras each. train_cameras, test_cameras: these lists by scale, which may be
     replaced. info: the dataset as read. cameras_extent: E in world units, from the training views. images: the store of
-    the decoded photos. ranks: processes that divide them (ImageStore). parts: of a training, None: those that args ask
-    for. halves: only right halves of views are scored, as by ScoredViews. given_test_views: the held-out views as read,
-    before parts changed the dataset.
+    the decoded photos. ranks: processes that divide them (ImageStore). parts: of a training (splatting/part.py), None:
+    those that args ask for. halves: only right halves of views are scored, as by ScoredViews. given_test_views: the
+    held-out views as read, before parts changed the dataset.
     """
 
     def __init__(
@@ -69,14 +69,14 @@ class Scene:
         resolution_scales: Sequence[float] = (1.0,),
         start: bool = True,
         ranks: Ranks = ALONE,
-        parts: Sequence[Part] | None = None,
+        parts: Sequence[Any] | None = None,
     ) -> None:
         self.model_path = args.model_path
         self.gaussians = gaussians
         self.loaded_iter = load_iteration
         if load_iteration is not None and start:
             self.loaded_iter = find_iteration(self.model_path, load_iteration)
-        self.parts = chosen(args) if parts is None else parts
+        self.parts = registry_of_parts().chosen(args) if parts is None else parts
         self.halves = False
         self.info = self._read(args)
         self.cameras_extent = self.info.extent
@@ -207,6 +207,11 @@ class Scene:
     def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""
         return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.undecoded]
+
+
+def registry_of_parts() -> ModuleType:
+    """Return splatting.registry, which lies above, for a call that brings no parts, as the reference's do."""
+    return import_module("splatting.registry")
 
 
 def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:

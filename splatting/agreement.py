@@ -66,8 +66,8 @@ _SIGNALS = (None, KeyboardInterrupt, Terminated)
 class StepAgreement(Part):
     """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
 
-    These go with the numbers that they exchange to render the iteration's view (`agree`), and are known when its
-    losses are. A signal counts for the iteration that begins after it, on all, whichever has got it.
+    These go with the numbers that they exchange to render the iteration's view (`all_gather_ints`), and are known when
+    its losses are. A signal counts for the iteration that begins after it, on all, whichever has got it.
     """
 
     def __init__(self, group: Ranks, interrupt: DeferredInterrupt, guard: StepGuard | None) -> None:

@@ -3,19 +3,18 @@
 import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from arguments.features import FEATURES
 from groundwork.finding import Finding, Severity
 from groundwork.host.listing import some
 from scene.checks.conversion import has_undistorted_photos
 from scene.gaussians import density_rules as rules
+from splatting.part import Strategy
 from splatting.records.error_curve import Row, gain_since_peak, peak
-from splatting.registry import part_class, strategies, tools
+from splatting.registry import strategies
 from splatting.resources import expected_count, little_space
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    from splatting.part import Strategy
 
 STRATEGY = "strategy"  # of the training, in the log's last record
 LATE_RESET = "opacities are reset"  # how the text of a late reset begins
@@ -69,12 +68,12 @@ def faster_alone(ranks: int, on_gpu: bool, count: int) -> Finding | None:
 
 def without_effect(opt: argparse.Namespace, strategy: str) -> Finding | None:
     """What to say of given options that belong to another strategy."""
-    others = [option for name in strategies() if name != strategy for option in part_class(name).options.optimisation]
+    others = [option for one in strategies() if one.name != strategy for option in FEATURES[one.name].optimisation]
     given = [f"--{option.name}" for option in others if getattr(opt, option.name) != option.default]
     return Finding(f"--strategy {strategy} ignores {some(given)}") if given else None
 
 
-def late_reset(density: "Strategy", opt: argparse.Namespace, done: int) -> Finding | None:
+def late_reset(density: Strategy, opt: argparse.Namespace, done: int) -> Finding | None:
     """What to say if a strategy resets opacities so late that the model cannot recover.
 
     done: iterations before this run, which may have been the reset. A run with a time budget leaves such resets out.
@@ -93,20 +92,20 @@ def late_reset(density: "Strategy", opt: argparse.Namespace, done: int) -> Findi
     return Finding(f"{LATE_RESET} in iteration {due[-1]}, and {left}", remedy)
 
 
-def another_number(density: "Strategy", opt: argparse.Namespace, count: int, first: int) -> Finding | None:
+def another_number(density: Strategy, opt: argparse.Namespace, count: int, first: int) -> Finding | None:
     """What to say if a strategy cannot reach its number of Gaussians in time.
 
     count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
     """
-    schedule, aim, strategy = density.schedule, density.max_gaussians, part_class(opt.strategy)
+    schedule, aim = density.schedule, density.max_gaussians
     if schedule.paced or schedule.schedule_step(first) >= density.ends > 0:
         return None  # what is repeated or resumed has no say in it any more
-    ending, start = strategy.until[0], f"--densify_from_iter {opt.densify_from_iter} is not before"
+    ending, start = density.until[0], f"--densify_from_iter {opt.densify_from_iter} is not before"
     if 0 < density.ends <= opt.densify_from_iter < schedule.length:
         return Finding(f"{start} --{ending} {density.ends}, so no Gaussians are added", "lower --densify_from_iter")
     reached = density.projected_count(count, first, schedule.ends)
     too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
-    remover = next((name for name in strategies() if part_class(name).removes), None)
+    remover = next((strategy.name for strategy in strategies() if strategy.removes), None)
     if not density.grows_to:
         remedy = f"--strategy {remover} removes the surplus" if remover and not too_late else ""
         text = f"{_start_of(count, opt)}; {opt.strategy} adds none, and removes only faint ones"
@@ -115,16 +114,16 @@ def another_number(density: "Strategy", opt: argparse.Namespace, count: int, fir
         return None
     done = schedule.schedule_step(first) - 1
     # Half of what is left suits rules that need the rest to settle, as those that end late by default do not.
-    ends = f"--{ending} {done + (schedule.length - done) // 2}" if strategy.until[1] == 1 / 2 else ""
+    ends = f"--{ending} {done + (schedule.length - done) // 2}" if density.until[1] == 1 / 2 else ""
     scaled = None
-    if not done and opt.densify_from_iter < density.ends < schedule.usual:
-        scaled = next((remedy(schedule.length) for remedy in tools("for_few_iterations")), None)
+    if not done and opt.densify_from_iter < density.ends < schedule.usual and hasattr(opt, "schedule"):
+        scaled = f"--schedule {schedule.length} in place of --iterations {schedule.length}"
     if too_late:
         window = f"--densify_from_iter {done + (schedule.length - done) // 20} {ends}".rstrip()
         why = f"{start} the end; give {scaled or window}"
-        if too_many and strategy.removes:
+        if too_many and density.removes:
             return Finding(_start_of(count, opt), f"only faint ones are removed, as {why}")
-    elif too_many and not strategy.removes:
+    elif too_many and not density.removes:
         why = f"it removes none; --strategy {remover} does"
     elif ends and schedule.length < density.ends:
         why = f"--{ending} {density.ends} is not before the end; give {scaled or ends}"

@@ -4,13 +4,12 @@ import sys
 from collections.abc import Callable, Mapping
 from functools import partial
 from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from torch import Tensor
+from torch import Tensor
 
-    from scene.cameras import Camera
-    from scene.gaussian_model import GaussianModel
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
 
 INTERVAL = 10  # iterations between losses: reading one waits for the GPU
 _FLUSHED = 10  # seconds until events are in the file at the latest
@@ -23,14 +22,14 @@ class Events:
         self._writer = writer
         self._iteration = iteration
 
-    def losses(self, l1: "Tensor", total: "Tensor", seconds: float) -> None:
+    def losses(self, l1: Tensor, total: Tensor, seconds: float) -> None:
         """Of every tenth iteration, and the seconds that it took."""
         if self._iteration % INTERVAL == 0:
             self._scalar("train_loss_patches/l1_loss", l1.item())
             self._scalar("train_loss_patches/total_loss", total.item())
             self._scalar("iter_time", seconds * 1000.0)
 
-    def image(self, views: str, camera: "Camera", what: str, image: "Tensor") -> None:
+    def image(self, views: str, camera: Camera, what: str, image: Tensor) -> None:
         """An image (3, H, W) of a view. views: the name of its set."""
         self._writer.add_image(f"{views}_view_{camera.image_name}/{what}", image, global_step=self._iteration)
 
@@ -39,7 +38,7 @@ class Events:
         for kind, value in means.items():
             self._scalar(f"{views}/loss_viewpoint - {kind.replace('l1', 'l1_loss')}", value)
 
-    def model(self, gaussians: "GaussianModel") -> None:
+    def model(self, gaussians: GaussianModel) -> None:
         """Its opacities, and how many Gaussians it has."""
         self._writer.add_histogram("scene/opacity_histogram", gaussians.get_opacity, self._iteration)
         self._scalar("total_points", len(gaussians))
@@ -65,11 +64,11 @@ class EventWriter:
             raise AttributeError(name)
         return partial(self._guarded, getattr(self._writer, name, None))
 
-    def add_image(self, tag: str, image: "Tensor", global_step: int) -> None:
+    def add_image(self, tag: str, image: Tensor, global_step: int) -> None:
         """Add an image (3, H, W), from 0 to 1, as a JPEG: a training took 8 s for PNGs and their checksums."""
         self._guarded(self._add_jpeg, tag, image, global_step)
 
-    def _add_jpeg(self, tag: str, image: "Tensor", step: int) -> None:
+    def _add_jpeg(self, tag: str, image: Tensor, step: int) -> None:
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary
 

@@ -2,7 +2,6 @@
 
 import math
 import time
-from typing import TYPE_CHECKING
 
 from groundwork.host.clock import wall_seconds
 from groundwork.host.progress import Bar
@@ -12,9 +11,7 @@ from splatting.iteration import Iteration, Losses
 from splatting.objective import LossWatch
 from splatting.part import Error, Part, overrides
 from splatting.records.error_curve import whole_sets
-
-if TYPE_CHECKING:
-    from splatting.run import Run
+from splatting.run import Run
 
 # Without a rate: that of the schedule is not that of iterations.
 BY_CLOCK = "{l_bar}{bar}| [{elapsed}<{remaining}{postfix}]"
@@ -27,7 +24,7 @@ class ProgressBar(Part):
 
     reads_model = False
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
         self._shown = {"Loss": run.losses}
         self._updated, self._done = -math.inf, run.first_iteration
@@ -76,7 +73,7 @@ def _iterations(count: int) -> str:
 class Summary(Part):
     """Says at the end what the model is worth, and how to look at it."""
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
         self._psnr: float | None = None
         self._iteration = run.first_iteration
@@ -101,7 +98,7 @@ class Records(Part):
     What parts add is also recorded at points of the curve.
     """
 
-    def __init__(self, run: "Run") -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
         self._seconds = 0.0
 

@@ -1,10 +1,20 @@
 """The manual of parts: what a feature adds to a training, in one class, which lies in one file.
 
-A part is a subclass of `Part` in splatting/features/NAME.py, called by NAME in capital words (depth_tv: DepthTv), and a
-line in splatting/registry.py. The place of that line is the part's in the one order of all hooks. No other file names
-it. Hooks are optional; those that a class does not override cost nothing. This module and every NAME.py import nothing
-heavy, as doctor.py reads them where torch is missing: hooks import what they need. A long method lies in a second file
-beside it, NAME_*.py. Functions for commands and other parts are listed by `tools` of splatting/registry.py.
+A part is a subclass of `Part` in splatting/features/NAME.py, called by NAME in capital words (depth_tv: DepthTv), and
+stands in the list of splatting/registry.py. Its place there is that in the one order of all hooks. Its options, if it
+has any, are an entry of arguments/features.py. No other file names it. Hooks are optional; those that a class does not
+override cost nothing. A long method lies in a second file beside it, NAME_*.py.
+
+Other people's programs may have a package `arguments` of their own, and make scenes, which load parts. So these import
+`arguments`, and what imports it, only where a training calls them.
+
+Classes are asked outside of a run, so these hooks are of the class:
+
+prepare      train.py has read its options. It may change them, or say that nothing is left to train.
+advise       train.py --advise and doctor.py look for options that a scene asks for.
+advise_trained  The same by a short training.
+examine      doctor.py looks at a trained model.
+backdrop     export.py separates the scene from what is behind it.
 
 A run (splatting/run.py), in the order in which it calls the hooks:
 
@@ -46,38 +56,26 @@ Values per row, which move with the rows, lie in model.columns.
 
 import argparse
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, TypeAlias
 
-from groundwork.host.errors import UserError
+from torch import Tensor
+
+from gaussian_renderer.scored_views import ScoredViews
+from groundwork.finding import Finding
+from scene.cameras import Camera
+from scene.readers.info import CameraInfo, SceneInfo
+from scene.readers.tracks import Track
+from scene.scene import Scene
+from splatting.iteration import Iteration, Losses, Term
+from utils.system_utils import UserError
 
 if TYPE_CHECKING:
-    from gaussian_renderer.scored_views import ScoredViews
-    from scene.cameras import Camera
-    from scene.readers.info import CameraInfo, SceneInfo
-    from scene.scene import Scene
-    from splatting.iteration import Iteration, Losses, Term
-    from splatting.option import Option
     from splatting.run import Run
 
 Error: TypeAlias = BaseException | None
-Scored: TypeAlias = "tuple[ScoredViews | None, Sequence[Camera]]"  # how, None: as all others; and which views
-
-
-@dataclass(frozen=True)
-class Options:
-    """Options of a part, by the group that they belong to."""
-
-    model: "tuple[Option, ...]" = ()
-    pipeline: "tuple[Option, ...]" = ()
-    optimisation: "tuple[Option, ...]" = ()
-    launch: "tuple[Option, ...]" = ()
-
-    @property
-    def by_name(self) -> "dict[str, Option]":
-        """All of them."""
-        return {option.name: option for group in vars(self).values() for option in group}
+Scored: TypeAlias = tuple[ScoredViews | None, Sequence[Camera]]  # how, None: as all others; and which views
 
 
 @dataclass(frozen=True)
@@ -103,8 +101,8 @@ class Needs:
 class Part:
     """Base of all parts.
 
-    name: of its module, the key of its state, and the option that brings it in by another value than its default.
-    options: that it declares.
+    name: of its module, the key of its state and of its options in arguments/features.py, and the option that brings it
+    in.
     active: whether it takes part; `begin` may clear it where a scene has no use for the part, which then has no hooks.
     by_state: whether its state in a checkpoint brings the part in where no option asks for it.
     needs: what it asks of the steps.
@@ -116,7 +114,6 @@ class Part:
     """
 
     name: ClassVar[str] = ""
-    options: ClassVar[Options] = Options()
     active = True
     by_state: ClassVar[bool] = False
     needs: ClassVar[Needs] = Needs()
@@ -128,8 +125,7 @@ class Part:
     @classmethod
     def wanted(cls, given: argparse.Namespace) -> bool:
         """Whether the options ask for the part."""
-        option = cls.options.by_name[cls.name]
-        return getattr(given, option.name, option.default) != option.default
+        return bool(getattr(given, cls.name, False))
 
     @classmethod
     def asked_by(cls, given: argparse.Namespace) -> str:
@@ -149,14 +145,44 @@ class Part:
         """Whether, by these options, steps depend on --iterations: a shorter training does not begin a longer one."""
         return False
 
+    @classmethod
+    def prepare(
+        cls, dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace, stops: Mapping[str, bool]
+    ) -> bool:
+        """Change options before a training. Returns whether anything is left to train. stops: all parts' `ends_by`."""
+        return True
+
+    @staticmethod
+    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterable[Finding]:
+        """Return findings on a scene, and options of train.py that they speak for."""
+        return ()
+
+    @staticmethod
+    def advise_trained(scene: Scene, views: ScoredViews) -> Iterable[Finding]:
+        """Do as `advise`, by a short training of small photos."""
+        return ()
+
+    @staticmethod
+    def examine(scene: Scene, views: ScoredViews) -> Iterable[Finding]:
+        """Return notes on a trained model."""
+        return ()
+
+    @staticmethod
+    def backdrop(facts: dict[str, Any], means: Tensor) -> Tensor | None:
+        """Return which Gaussians of a model are not of the scene itself, (N,) bool; None: it has none of this part's.
+
+        facts: of model.json. means: (N, 3) in the model's frame.
+        """
+        return None
+
     def check(self, run: "Run", state: Any) -> None:
         """Refuse what cannot be trained (UserError). Nothing is written yet. state: as for `begin`."""
 
-    def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
+    def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         """The dataset with other views or points. args: the model options. fresh: it is read for a new training."""
         return info
 
-    def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
+    def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
         """Cameras of the scene's training views, or of those that are held out, with the records they are made of."""
 
     def begin(self, run: "Run", state: Any) -> None:
@@ -168,7 +194,7 @@ class Part:
     def opened(self, run: "Run") -> None:
         """The log is open, and files may be written."""
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
+    def terms(self, at: Iteration) -> dict[str, Term]:
         """What the iteration adds to the loss, weights included, by names for logs.
 
         A term gets the result of `render`, not clamped, and the mask of the pixels that count; at.camera.columns are
@@ -183,7 +209,7 @@ class Part:
         """
         return False
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         """The optimiser has taken the iteration's step, so not in the last iteration, which takes none.
 
         at.changes: rows, the SH degree or sizes of views have changed, or will by parts that follow.
@@ -193,13 +219,13 @@ class Part:
         """Numbers for a record of the log, asked once all parts are told of the iteration's losses."""
         return {}
 
-    def save(self, scene: "Scene") -> None:
+    def save(self, scene: Scene) -> None:
         """Write own files into the model folder of a scene, beside a PLY or a checkpoint."""
 
-    def load(self, scene: "Scene", args: argparse.Namespace) -> None:
+    def load(self, scene: Scene, args: argparse.Namespace) -> None:
         """Read own files of the model folder, once its Gaussians are loaded. args: the model options."""
 
-    def scored(self, scene: "Scene", pipe: argparse.Namespace, background: Any) -> "dict[str, Scored]":
+    def scored(self, scene: Scene, pipe: argparse.Namespace, background: Any) -> dict[str, Scored]:
         """Further sets of test views, by what is put behind the name of the set."""
         return {}
 
@@ -210,7 +236,7 @@ class Part:
         """Entries of model.json."""
         return {}
 
-    def due(self, at: "Iteration") -> bool:
+    def due(self, at: Iteration) -> bool:
         """Whether this iteration reads the model or a loss, or writes something. Asked once, when it begins.
 
         If so, all steps before it are done by then, and every loss so far is checked first in `measured`. Otherwise the
@@ -218,13 +244,13 @@ class Part:
         """
         raise NotImplementedError
 
-    def begins(self, at: "Iteration") -> None:
+    def begins(self, at: Iteration) -> None:
         """The iteration begins, with its view."""
 
-    def measured(self, at: "Iteration", losses: "Losses") -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         """The losses are computed. If the iteration is due, the model is still the one that was rendered."""
 
-    def stepped(self, at: "Iteration") -> None:
+    def stepped(self, at: Iteration) -> None:
         """Density control and optimiser are done; the model is that of the next iteration."""
 
     def ended(self, error: Error) -> None:
@@ -236,7 +262,6 @@ class Strategy(Part):
 
     It joins a run once it is chosen, which may be late: `check` and `begin` are called then, when the model has its
     optimiser, and all hooks after them.
-    summary: of what it does, for the help.
     until: the option of the step at which it ends, and the part of the schedule that this is by default.
     removes: whether it removes Gaussians down to a given number.
     grows_to: whether it is meant to reach max_gaussians; not where nobody gives a number, with default_is_limit.
@@ -260,7 +285,6 @@ class Strategy(Part):
         rules that count steps take the iteration.
     """
 
-    summary: ClassVar[str] = ""
     until: ClassVar[tuple[str, float]] = "densify_until_iter", 1 / 2
     removes: ClassVar[bool] = False
     grows_to: ClassVar[bool] = True
@@ -338,22 +362,21 @@ class Strategy(Part):
         """Decay of Adam's averages of squared gradients. None: the optimiser's."""
         return None
 
-    def after_backward(self, at: "Iteration", package: dict[str, Any]) -> None:
+    def after_backward(self, at: Iteration, package: dict[str, Any]) -> None:
         """Called with all gradients computed, before Adam. Plain steps only. package: the result of `render`."""
         self.change_rows(at)
 
-    def change_rows(self, at: "Iteration") -> None:
+    def change_rows(self, at: Iteration) -> None:
         """Change what `skips_step` tells of, once the view counts in the statistics."""
 
 
 class Appearance(Part):
     """A part that trains how photos show renders (--appearance KIND), of which a training has one at most.
 
-    kind, summary: the value of the option, and what it does, for the help. flag: a further option that asks for it.
+    kind: the value of the option. flag: a further option that asks for it. arguments/features.py has both, too.
     """
 
     kind: ClassVar[str] = ""
-    summary: ClassVar[str] = ""
     flag: ClassVar[str] = ""
 
     @classmethod

@@ -1,71 +1,70 @@
 """The registry of the parts of a training (splatting/part.py is their manual): their one order."""
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Mapping
-from functools import cache
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any
 
-from groundwork.host.errors import UserError
+from splatting.features.adc import Adc
+from splatting.features.budget import Budget
+from splatting.features.curve import Curve
+from splatting.features.depths import Depths
+from splatting.features.exposure import Exposure
+from splatting.features.mcmc import Mcmc
+from splatting.features.ppisp import Ppisp
+from splatting.features.refine_poses import RefinePoses
+from splatting.features.remote_viewer import RemoteViewer
+from splatting.features.resume import Resume
+from splatting.features.robust_mask import RobustMask
+from splatting.features.sky import Sky
+from splatting.features.sleep import Sleep
+from splatting.features.sparse_depth import SparseDepth
+from splatting.features.spill import Spill
+from splatting.features.tensorboard import Tensorboard
+from splatting.features.time_budget import TimeBudget
+from splatting.features.viewer import Viewer
 from splatting.part import Appearance, Part, Strategy
+from utils.system_utils import UserError
 
-if TYPE_CHECKING:
-    from splatting.option import Option
-
-# Names of modules, with the reason for the place, where there is one.
-PARTS = (
-    "time_budget",
-    "exposure",  # adds training views before anything moves them
-    "refine_poses",  # its cameras stand right before anything asks where they are
-    "depths",
-    "curve",  # its scores are those of the model that is saved in the same iteration
-    "robust_mask",
-    "adc",  # the first strategy is the default
-    "mcmc",  # before budget: where a time is given, the first that is best in it is taken
-    "budget",
-    "sky",
-    "sparse_depth",  # the order of the terms of the loss is in the bytes of the model
-    "ppisp",
-    "spill",  # after all that moves rows, and before sleep, which pays where rows lie on the host
-    "sleep",  # after all that decides whether every step concerns all rows
-    "tensorboard",  # from here on, those that only watch
-    "resume",  # before all that may let the training wait
-    "remote_viewer",
-    "viewer",  # last: its pause is of all else
+# With the reason for the place, where there is one.
+PARTS: tuple[type[Part], ...] = (
+    TimeBudget,
+    Exposure,  # adds training views before anything moves them
+    RefinePoses,  # its cameras stand right before anything asks where they are
+    Depths,
+    Curve,  # its scores are those of the model that is saved in the same iteration
+    RobustMask,
+    Adc,  # the first strategy is the default
+    Mcmc,  # before Budget: where a time is given, the first that is best in it is taken
+    Budget,
+    Sky,
+    SparseDepth,  # the order of the terms of the loss is in the bytes of the model
+    Ppisp,
+    Spill,  # after all that moves rows, and before Sleep, which pays where rows lie on the host
+    Sleep,  # after all that decides whether every step concerns all rows
+    Tensorboard,  # from here on, those that only watch
+    Resume,  # before all that may let the training wait
+    RemoteViewer,
+    Viewer,  # last: its pause is of all else
 )
 
 
-@cache
-def part_class(name: str) -> type[Part]:
-    """The class of the module `name`: its name in capital words."""
-    return getattr(import_module(f"splatting.features.{name}"), "".join(map(str.capitalize, name.split("_"))))
-
-
-def strategies() -> list[str]:
-    """Names of the strategies of density control."""
-    return [name for name in PARTS if issubclass(part_class(name), Strategy)]
+def strategies() -> list[type[Strategy]]:
+    """Return the strategies of density control; the first is the default."""
+    return [part for part in PARTS if issubclass(part, Strategy)]
 
 
 def strategy_part(name: str) -> Strategy:
-    """The part of a strategy. UserError for a name that is none of one: a file of another run may say anything."""
-    if name not in strategies():
-        raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(strategies())}")
-    return part_class(name)()
+    """Make the part of a strategy. UserError for a name that is none of one: a file of another run may say anything."""
+    known = {strategy.name: strategy for strategy in strategies()}
+    if name not in known:
+        raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(known)}")
+    return known[name]()
 
 
 def in_order(parts: Iterable[Part]) -> list[Part]:
-    """The parts in the order of the registry."""
-    return sorted(parts, key=lambda part: PARTS.index(part.name))
-
-
-def appearances() -> list[type[Appearance]]:
-    """The parts that train how photos show renders (--appearance)."""
-    return [kind for kind in map(part_class, PARTS) if issubclass(kind, Appearance)]
-
-
-def options_of(group: str) -> "list[Option]":
-    """What the parts declare of a group of options: model, pipeline, optimisation or launch."""
-    return [option for name in PARTS for option in getattr(part_class(name).options, group)]
+    """Sort parts as the registry has them."""
+    names = [part.name for part in PARTS]
+    return sorted(parts, key=lambda part: names.index(part.name))
 
 
 EXPOSURES = "exposures"  # the model's own key of what an appearance has trained
@@ -82,10 +81,10 @@ _OLD_KEYS = {
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """The states of parts by their names, from the extra state of a checkpoint. UserError for one of no part."""
-    kinds = {kind.kind: kind.name for kind in appearances()}
+    kinds = {part.kind: part.name for part in PARTS if issubclass(part, Appearance)}
     renamed = _OLD_KEYS | {EXPOSURES: kinds.get(checkpoint.get(EXPOSURES, {}).get("kind", "affine"), EXPOSURES)}
     named = {renamed.get(key, key): state for key, state in checkpoint.items()}
-    if unknown := sorted(map(str, named.keys() - {*PARTS})):
+    if unknown := sorted(map(str, named.keys() - {part.name for part in PARTS})):
         raise UserError(
             f"the checkpoint has a state of {unknown[0]}, which this code does not have; use the code that wrote it, "
             "or start a new training from its PLY by --init_ply"
@@ -98,8 +97,7 @@ def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part
 
     given: options of all groups. states: names of parts that a checkpoint has states of.
     """
-    kinds = map(part_class, PARTS)
-    return [kind() for kind in kinds if kind.wanted(given) or (kind.by_state and kind.name in states)]
+    return [part() for part in PARTS if part.wanted(given) or (part.by_state and part.name in states)]
 
 
 def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
@@ -116,17 +114,3 @@ def check_together(parts: Collection[Part], given: argparse.Namespace, several: 
             there = getattr(given, name, None)
             if str(there) == value if value else there:
                 raise UserError(f"{option} does not work with --{name}{value and ' '}{value}, {reason}")
-
-
-def tools(name: str) -> list[Callable]:
-    """The functions of a name that modules of parts have for others, which thus need no part.
-
-    advise(scene, tracks): findings on a scene, and options of train.py that they speak for.
-    backdrop(facts, means): which Gaussians of a model are not of the scene itself. facts: of model.json.
-    advise_trained(scene, views): as advise, by a short training. examine(scene, views): notes of doctor.py.
-    for_wrong_poses(best), for_few_iterations(count): remedies.
-    pictures(model): files in a model folder that reports show, where they are there.
-    prepare(dataset, opt, launch): may name the checkpoint to start with; False: nothing is left to train.
-    """
-    modules = [import_module(f"splatting.features.{part}") for part in PARTS]
-    return [getattr(module, name) for module in modules if hasattr(module, name)]

@@ -40,7 +40,7 @@ from splatting.objective import LossWatch, Objective
 from splatting.part import Part, Strategy, overrides
 from splatting.records.error_curve import Row
 from splatting.records.training_log import Stopwatch, TrainingLog
-from splatting.registry import check_together, chosen, in_order, part_class, states_in, strategy_part
+from splatting.registry import PARTS, check_together, chosen, in_order, states_in, strategies, strategy_part
 from splatting.resources import announce_memory
 from splatting.save import Checkpoints
 from splatting.schedule import USUAL, Schedule
@@ -53,8 +53,8 @@ class Run:
     """The objects that the loop and its observers share, and what they ask of them in each iteration.
 
     Options: dataset, opt, pipe, launch. Made by them: scene, gaussians, views (by iteration), objective, density,
-    schedule, background (3,), parts in their order. group: the processes that train together. start: a chkpntN.pth that
-    is resumed, or None; first_iteration: done before this run.
+    schedule, background (3,), parts in their order. strategies: the classes of all that there are. group: the processes
+    that train together. start: a chkpntN.pth that is resumed, or None; first_iteration: done before this run.
     sleeping, sizes, pixel_filter, camera_steps, has_new_photos: slots that parts fill (splatting/part.py).
     interrupt: a signal that asks the loop to stop; an observer that waits has to check it. resources: what parts have
     open, closed when the training is over, however it ends. warnings: what was warned of.
@@ -120,7 +120,8 @@ class Run:
         self._prepare_records()
 
     def _fill_slots(self) -> None:
-        """What parts may replace."""
+        """Set what parts ask for and may replace."""
+        self.strategies = strategies()
         self.parts: Sequence[Part] = ()
         self._hooks: dict[str, list[Callable]] = {}
         self.sleeping: Sleeping | None = None
@@ -141,8 +142,9 @@ class Run:
         given, states = self._all_options, states_in(extra_state(capture)) if capture else {}
         self.parts = chosen(given, states)
         check_together(self.parts, given, self.group.several)
-        for name in states.keys() - {part.name for part in self.parts}:
-            if text := part_class(name).dropped(given, self.first_iteration):
+        for part in PARTS:
+            dropped = part.name in states and part.name not in {there.name for there in self.parts}
+            if dropped and (text := part.dropped(given, self.first_iteration)):
                 print(f"warning: {text}", file=sys.stderr)
         for check in self.each("check"):
             check(self, states.get(check.__self__.name))

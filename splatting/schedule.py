@@ -9,8 +9,6 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from splatting.registry import strategies
-
 if TYPE_CHECKING:
     from splatting.run import Run
 
@@ -97,7 +95,7 @@ class Schedule:
 
     def best_strategy(self, run: "Run") -> str:
         """The strategy of a new run that names none: the first in the registry."""
-        return strategies()[0]
+        return run.strategies[0].name
 
     def nothing_left(self, checkpoint: str, iteration: int) -> str:
         """Why a run that would resume a checkpoint has nothing to do."""

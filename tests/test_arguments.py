@@ -19,7 +19,7 @@ from arguments import (
     write_cfg_args,
     write_model_json,
 )
-from splatting.option import MOST_NEEDED, TOPICS
+from arguments.option import MOST_NEEDED, TOPICS
 from utils.system_utils import UserError
 
 # fmt: off

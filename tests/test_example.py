@@ -1,4 +1,4 @@
-"""The worked examples of parts (tests/parts/example): each is one file and one line, and resumes to the byte."""
+"""The worked examples of parts (tests/parts/example): each is a file, options and a line, and resumes to the byte."""
 
 import json
 import shutil
@@ -11,17 +11,25 @@ import torch
 from forks import Done, fork
 
 ROOT = Path(__file__).resolve().parents[1]
-WITH_EXAMPLE = """
+WITH_EXAMPLE = '''
 import sys
+from pathlib import Path
+sys.path.append("tests")
+from other_sources import edit
 import splatting.features
-import splatting.registry as registry
 splatting.features.__path__.append("tests/parts/example")
-registry.PARTS = (*registry.PARTS, "patient", "grey")
+registered = """
+from splatting.features.grey import Grey
+from splatting.features.patient import Patient
+PARTS = (*PARTS, Patient, Grey)
+"""
+options = Path("tests/parts/example/options.py").read_text()
+edit({"arguments.features": lambda source: source + options, "splatting.registry": lambda source: source + registered})
 import train
 scene, *words = sys.argv[1:]
 options = ["-s", scene, "-r", "48", "--iterations", "40", "--disable_viewer", "--no_curve", "--test_iterations", "-1"]
 train.main([*options, *words])
-"""
+'''
 
 
 def _train(scene: Path, *words: object) -> Done:
@@ -75,13 +83,14 @@ def test_a_strategy_with_a_value_for_each_gaussian(colmap_scene, tmp_path):
 
 @pytest.mark.slow
 def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
-    """As the guide has them made: a file and a line each."""
+    """As the guide has them made: a file, an entry of options and a line each."""
     for path in (*ROOT.glob("*.py"), ROOT / "pyproject.toml", ROOT / "version.txt"):
         shutil.copy(path, tmp_path)
     for room in (
         "arguments",
         "gaussian_renderer",
         "applications",
+        "groundwork",
         "lpipsPyTorch",
         "scene",
         "splatting",
@@ -91,11 +100,13 @@ def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
         shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("node_modules", "__pycache__"))
     for name in ("grey", "patient"):
         shutil.copy(ROOT / "tests/parts/example" / f"{name}.py", tmp_path / "splatting/features")
+    with open(tmp_path / "arguments/features.py", "a", encoding="utf-8") as table:
+        table.write((ROOT / "tests/parts/example/options.py").read_text(encoding="utf-8"))
     registry = tmp_path / "splatting/registry.py"
-    registry.write_text(
-        registry.read_text().replace('    "sparse_depth",', '    "grey",\n    "patient",\n    "sparse_depth",')
-    )
-    rules = "nobody_names and (adc or grey or patient) or hidden1 or tools"
+    text = registry.read_text(encoding="utf-8").replace("    SparseDepth,", "    Grey,\n    Patient,\n    SparseDepth,")
+    imports = "".join(f"from splatting.features.{name} import {name.capitalize()}\n" for name in ("grey", "patient"))
+    registry.write_text(text.replace("from splatting.features.mcmc", f"{imports}from splatting.features.mcmc"))
+    rules = "nobody_names and (adc or grey or patient) or hidden1"
     command = [
         sys.executable,
         "-m",

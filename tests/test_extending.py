@@ -32,7 +32,7 @@ pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "inside" / "extending.md"
 CODE = (
-    *("arguments", "gaussian_renderer", "splatting", "scene", "utils"),
+    *("applications", "arguments", "gaussian_renderer", "groundwork", "splatting", "scene", "utils"),
     *("train.py", "render.py", "export.py", "pyproject.toml", "version.txt"),
 )
 HOT, COLD, START = 0.9, 0.2, 0.5

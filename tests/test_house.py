@@ -30,6 +30,11 @@ FLOORS = (
     ("applications.convert", "applications.demo", "applications.doctor", "applications.export"),
     ("applications",),
     ("splatting.commands",),
+    ("splatting.loop",),
+    ("splatting.faster", "splatting.log"),
+    ("splatting.run",),
+    ("splatting.checks",),
+    ("splatting.registry",),
     ("splatting.features",),
     ("splatting",),
     ("splatting.records",),
@@ -42,8 +47,6 @@ FLOORS = (
     ("scene.splats",),
     ("scene.readers",),
     ("scene.colmap_loader", "scene.gaussians", "scene.images"),
-    ("splatting.registry",),  # finds splatting.features by their names
-    ("splatting.option", "splatting.part"),
     ("utils",),
     ("groundwork.applications", "groundwork.finding"),
     ("groundwork.files",),
@@ -236,6 +239,8 @@ SAID_IN = {
     "torch.ops.diff_gaussian_rasterization": ("submodules", "benchmarks"),
     # Commands run as modules, but for setup.py, whose builder is in no package, and what the reference runs as a file.
     "sys.path": ("submodules", "setup", "utils.make_depth_scale"),
+    # What lies above: parts, for a scene that nobody gives any.
+    'import_module("splatting': ("scene.scene",),
 }
 
 

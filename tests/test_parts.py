@@ -13,8 +13,9 @@ import pytest
 from forks import fork
 from synthetic import make_colmap_scene
 
-from splatting.part import Part, fill, overrides
-from splatting.registry import PARTS, part_class, states_in, strategies, tools
+from arguments.features import FEATURES, appearances, strategies
+from splatting.part import Appearance, Part, Strategy, fill, overrides
+from splatting.registry import PARTS, states_in
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -24,6 +25,8 @@ NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  #
 EVALUATION = "applications/evaluation/command.py"
 KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
     ("time_budget", "applications/nerfbaselines/spec.py"),  # a set of options, as a user gives it
+    ("refine_poses", "scene/checks/fit.py"),  # remedies
+    ("schedule", "splatting/checks.py"),
     ("no_curve", "applications/nerfbaselines/method.py"),
     ("no_curve", "applications/doctor/advice.py"),  # of a short training
     ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
@@ -46,11 +49,13 @@ KNOWN = {  # words in files that are options of a part, and mean something else 
     ),
     ("disable_viewer", "applications/nerfbaselines/method.py"),
 }
+CLASSES = {part.name: part for part in PARTS}
+NAMES = [*CLASSES]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
 
 
 def _options(name: str) -> set[str]:
-    return {*part_class(name).options.by_name}
+    return {*FEATURES[name].by_name} if name in FEATURES else set()
 
 
 def _own(name: str) -> list[Path]:
@@ -59,15 +64,15 @@ def _own(name: str) -> list[Path]:
 
 def _heirs(name: str) -> list[str]:
     """The parts that inherit from a part, as strategies may."""
-    return [other for other in PARTS if other != name and issubclass(part_class(other), part_class(name))]
+    return [other for other in NAMES if other != name and issubclass(CLASSES[other], CLASSES[name])]
 
 
 def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: all but its own, its heirs' and the registry."""
+    """All Python files of the project that may not know a part: all but its own, its heirs' and the two tables."""
     found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py") if "tests" not in path.parts)]
     found += [ROOT / f"{c}.py" for c in COMMANDS]
-    registry = ROOT / "splatting" / "registry.py"
-    may = [registry, *(path for one in (name, *_heirs(name)) for path in _own(one))]
+    places = [ROOT / "splatting" / "registry.py", ROOT / "arguments" / "features.py"]
+    may = [*places, *(path for one in (name, *_heirs(name)) for path in _own(one))]
     yield from (path for path in found if path not in may)
 
 
@@ -98,32 +103,41 @@ def _names_of(name: str, path: Path) -> Iterator[str]:
             yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its files"
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize("name", NAMES)
 def test_nobody_names_a_part_outside_of_its_files(name):
     assert [line for path in _files(name) for line in _names_of(name, path)] == []
 
 
-def test_what_declares_parts_imports_nothing_heavy():
-    """As doctor.py and convert.py read it where torch is missing."""
-    code = "import sys, splatting.registry as r; list(map(r.part_class, r.PARTS)); print(*sys.modules)"
+def test_options_import_nothing_heavy_and_no_part():
+    """As doctor.py reads them where torch is missing."""
+    code = "import sys, arguments.launch; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert not {"torch", "numpy", "scene", "arguments"} & {*done.stdout.split()}
+    assert not {"torch", "numpy", "scene", "splatting"} & {*done.stdout.split()}
 
 
-def test_tools_are_functions_of_parts():
-    for name in re.findall(r"\b(\w+)\(", tools.__doc__):
-        of = [tool.__module__.split(".")[-1] for tool in tools(name)]
-        assert of and {*of} <= {*PARTS}, name
+def test_parts_import_no_options_which_another_package_may_hide():
+    """As where other people's code with a package `arguments` of its own calls `Scene`."""
+    done = fork("import sys; sys.modules['arguments'] = None; import splatting.registry")
+    assert done.status == 0, done.stderr
 
 
-# A program in which some parts are not there: neither their lines of the registry nor their files.
+def test_the_table_of_options_has_parts_in_their_order_and_what_they_are():
+    assert [*FEATURES] == [name for name in NAMES if name in FEATURES]
+    assert [*strategies()] == [part.name for part in PARTS if issubclass(part, Strategy)]
+    flags = {part.kind: part.flag for part in PARTS if issubclass(part, Appearance)}
+    assert {one.name: one.flag for one in appearances()} == flags
+
+
+# A program in which some parts are not there: neither their lines of the registry, their options nor their files.
 WITHOUT = """
 import sys
+from functools import partial
 from pathlib import Path
-import splatting.registry as registry
+sys.path.append("tests")
+from other_sources import PLACES, edit, without
 hidden, *words = sys.argv[1:]
 hidden = hidden.split(",")
-registry.PARTS = tuple(name for name in registry.PARTS if name not in hidden)
+edit(dict.fromkeys(PLACES, partial(without, hidden=hidden)))
 files = [path for name in hidden for path in Path("splatting/features").glob(f"{name}*.py")]
 sys.modules |= {f"splatting.features.{path.stem}": None for path in files}
 """
@@ -147,9 +161,9 @@ def _halves() -> list[list[str]]:
 
     What inherits from a part goes with it.
     """
-    digits = range((len(PARTS) - 1).bit_length())
-    halves = [{name for n, name in enumerate(PARTS) if n >> digit & 1 == bit} for digit in digits for bit in (0, 1)]
-    return [[name for name in PARTS if name in half or any(name in _heirs(one) for one in half)] for half in halves]
+    digits = range((len(NAMES) - 1).bit_length())
+    halves = [{name for n, name in enumerate(NAMES) if n >> digit & 1 == bit} for digit in digits for bit in (0, 1)]
+    return [[name for name in NAMES if name in half or any(name in _heirs(one) for one in half)] for half in halves]
 
 
 @pytest.mark.parametrize("hidden", _halves())
@@ -157,7 +171,7 @@ def test_without_half_of_the_parts_all_else_imports_and_lacks_their_options_alon
     done = fork(WITHOUT + IMPORTED, ",".join(hidden), *ROOMS, *(f"{command}.py" for command in COMMANDS))
     assert done.status == 0, done.stderr
     there, gone = {*done.stdout.split()}, {option for name in hidden for option in _options(name)}
-    assert not there & gone and {option for name in PARTS for option in _options(name)} - gone <= there
+    assert not there & gone and {option for name in NAMES for option in _options(name)} - gone <= there
 
 
 TRAINED = """

@@ -32,11 +32,12 @@ from trainings import (
 )
 
 import train
+from arguments.features import strategies
 from groundwork.ranks.ranks import ranks
 from scene.readers.point_cloud import write_point_cloud
 from splatting import log
 from splatting.faster.graphs import Graphs
-from splatting.registry import PARTS, part_class, strategies
+from splatting.registry import PARTS
 from utils.system_utils import UserError
 
 Result = dict[str, bytes | list]
@@ -161,7 +162,7 @@ def _covering(pairs: set[frozenset[str]]) -> Iterator[list[str]]:
 
 
 def test_pairs_of_parts_resumed(scene, tmp_path):
-    begin = {name for name in PARTS if {"begin", "state"} & {*vars(part_class(name))}}
+    begin = {part.name for part in PARTS if {"begin", "state"} & {*vars(part)}}
     # test_more_photos.py has the first; the second keeps nothing, and test_resumed has the last.
     assert begin - {"resume", "remote_viewer", "sleep"} <= PART_OPTIONS.keys()
     pairs = {frozenset(pair) for pair in combinations(PART_OPTIONS, 2) if _goes_together(*pair)}

@@ -13,12 +13,12 @@ import numpy as np
 
 from groundwork.finding import Finding
 from groundwork.host.listing import some
+from scene.checks.fit import REFINE
 from scene.checks.photo_files import blurred
 from scene.checks.photos import SHARED_TEXT
 from scene.checks.points import FEWEST_POINTS
 from scene.images.exif import Lens
 from scene.images.exposures import EXPOSURES
-from splatting.registry import tools
 from utils.system_utils import UserError
 
 if TYPE_CHECKING:
@@ -197,8 +197,7 @@ def check_given_poses(model: "Model", images: Sequence[str]) -> Iterator[Finding
         text = f"{len(out)} of {len(images)} photos have no pose in the file and were left out ({some(out)})"
         yield Finding(text, "add their poses, or omit --poses")
     if model.points < FEWEST_POINTS or _has_large_error(model):
-        remedies = "; ".join((remedy, *(remedy_of(True) for remedy_of in tools("for_wrong_poses"))))
-        yield Finding(f"the photos fit the given poses badly ({fit})", remedies)
+        yield Finding(f"the photos fit the given poses badly ({fit})", f"{remedy}; {REFINE}")
 
 
 def check_shared_cameras(

@@ -17,6 +17,7 @@ import numpy as np
 
 from applications.doctor.model import load_scored
 from arguments import ModelParams, read_training_options
+from arguments.features import options_of
 from groundwork.files.json_files import write_json
 from groundwork.finding import Finding, note
 from groundwork.ranks.ranks import ranks
@@ -25,7 +26,7 @@ from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
 from scene.readers.tracks import Track, read_tracks
 from scene.scene import Scene
-from splatting.registry import check_together, chosen, options_of, tools
+from splatting.registry import PARTS, check_together, chosen
 from utils.system_utils import UserError, mkdir_p
 
 ADVICE = "advice.json"  # what train.py --advise writes: texts, and options that the scene asks for
@@ -55,8 +56,8 @@ def advise(dataset: argparse.Namespace, trains: bool = True, warns: bool = False
     tracks = read_tracks(dataset.source_path, scene.info.train_cameras, scene.info.offset)
     if any(tracks):
         yield from _check_distances(scene, tracks)
-    for advise_part in tools("advise"):
-        yield from advise_part(scene, tracks)
+    for part in PARTS:
+        yield from part.advise(scene, tracks)
     if trains:
         yield from _train_shortly(dataset)
 
@@ -188,5 +189,5 @@ def _train_shortly(dataset: argparse.Namespace) -> Iterator[Finding]:
         print(f"{_ITERATIONS:,} iterations on photos of {_WIDTH} pixels show what the records do not", flush=True)
         _train([sys.executable, str(ROOT / "train.py"), *map(str, own), *_list_data_words(dataset)])
         scene, views = load_scored(folder)
-        for advise_part in tools("advise_trained"):
-            yield from advise_part(scene, views)
+        for part in PARTS:
+            yield from part.advise_trained(scene, views)

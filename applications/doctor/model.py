@@ -13,6 +13,7 @@ import torch
 from applications.doctor.changes import FITS as BAD_PSNR
 from applications.doctor.changes import LOST, find_changes, read_recorded_psnr
 from arguments import ModelParams, PipelineParams, read_model_json, read_stored_options
+from arguments.features import options_of
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.finding import Finding, fine, from_error
 from scene import Scene
@@ -26,7 +27,7 @@ from splatting.checks import LATE_RESET, check_overfitting
 from splatting.records.model_folder import closing_lines, curve_of
 from splatting.records.training_log import NAME as LOG
 from splatting.records.training_log import read_log
-from splatting.registry import options_of, tools
+from splatting.registry import PARTS
 from utils.image_utils import as_float, pixels_that_count, psnr
 from utils.system_utils import UserError, compute_device
 
@@ -131,8 +132,9 @@ def _check_finite(gaussians: GaussianModel) -> Iterator[Finding]:
 
 def _examine_parts(scene: Scene, options: argparse.Namespace) -> Iterator[Finding]:
     """Ask the parts of a training for notes on the trained model."""
-    for examine in tools("examine"):
-        yield from examine(scene, _make_scored_views(scene, options))
+    views = _make_scored_views(scene, options)
+    for part in PARTS:
+        yield from part.examine(scene, views)
 
 
 def load_scored(model_path: str) -> tuple[Scene, ScoredViews]:

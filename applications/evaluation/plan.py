@@ -14,7 +14,7 @@ from typing import Any
 
 from arguments import OptimizationParams
 from groundwork.files.json_files import read_json, write_json
-from splatting.registry import PARTS, part_class
+from splatting.registry import PARTS
 from utils.system_utils import UserError
 
 _OUTDOOR = ("-i", "images_4")
@@ -35,7 +35,7 @@ RESERVED = {"figures"}  # folders of the report, next to the models
 _DEFAULT_ITERATIONS = next(option.default for option in OptimizationParams.options if option.name == "iterations")
 
 RECORD = "full_eval.json"  # in a model folder: finished stages with their inputs, machine and seconds
-ENDING = [option for name in PARTS for option in part_class(name).ends_by]  # they end a training by themselves
+ENDING = [option for part in PARTS for option in part.ends_by]  # they end a training by themselves
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,7 @@ from groundwork.host.machine import one_line
 from scene.readers.info import from_above, up_of
 from splatting.records.figures import draw_cameras, draw_curves, draw_poses, draw_sizes
 from splatting.records.model_folder import json_or_none
-from splatting.records.renders import GAIN, ComparedViews
-from splatting.registry import tools
+from splatting.records.renders import GAIN, MASK_PICTURE, ComparedViews
 from utils.system_utils import UserError, atomic_write
 
 TITLE = "3D Gaussian Splatting: evaluation"
@@ -125,7 +124,7 @@ def write_report(report: Mapping[str, Any], output: Path) -> None:
             "curves": _draw_figures(draw_curves, folder, scene, members, peers),
             "poses": _draw_figures(draw_poses, folder, scene, members),
             "sizes": _draw_figures(draw_sizes, folder, scene, members),
-            "masked": [path for run in members for path in _list_pictures(output / run["model"])],
+            "masked": [path for run in members if (path := output / run["model"] / MASK_PICTURE).is_file()],
             "views": _show_views(output, scene, members, each),
         }
     texts = {f"report.{kind}": render(kind, report, pictures, output) for kind in ("md", "html")}
@@ -155,11 +154,6 @@ def _find_cameras(output: Path, runs: Sequence[Run]) -> dict[str, list[np.ndarra
         if run["split"] and count is not None:
             found.setdefault(run["split"], np.split(flat, [len(flat) - count]))
     return found
-
-
-def _list_pictures(model: Path) -> list[Path]:
-    """List the pictures of a model folder that parts of its training have drawn."""
-    return [path for pictures in tools("pictures") for path in pictures(model) if path.is_file()]
 
 
 def _draw_figures(draw: Callable[..., list[Path]], *content: Any) -> list[Path]:

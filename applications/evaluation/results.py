@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import os
 import sys
@@ -10,13 +11,15 @@ from typing import Any
 
 from applications.evaluation.plan import Record, Run, SceneEntry, describe_photos, is_model
 from applications.evaluation.stages import Failure, page_file
-from arguments import read_model_json
-from groundwork.files.json_files import read_json
+from arguments import read_model_json, read_stored_options
+from groundwork.files.json_files import SCHEDULE, read_json
+from scene.gaussians.sh_bands import SH_INTERVAL
 from scene.readers.info import HOLD
 from splatting.records import model_folder as folder_of
 from splatting.records.error_curve import Row, gain_since_peak, peak
 from splatting.records.renders import BESIDE, SCORES, TIMES, image_size, view_names, worst_views
 from splatting.records.training_log import DEGREES, PERCENT
+from splatting.registry import PARTS
 from utils.system_utils import UserError, saved_ply
 
 REPORT = "report.json"
@@ -41,7 +44,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
     if found := peak(curve):
         best = {"iteration": found[0]["iteration"], "test_psnr": found[0]["test_psnr"], "lost": found[1],
                 "gained": gain_since_peak(curve),
-                "shorter_ends_there": folder_of.shorter_ends_there(model, found[0]["iteration"])}  # fmt: skip
+                "shorter_ends_there": shorter_ends_there(model, found[0]["iteration"])}  # fmt: skip
     saved = folder_of.trained_iterations(model)
     views = {"final_iteration": None, "iterations": {}, "split": None, "test_sizes": [], "worst_views": [],
              "views": {"test": None, "train": None}}  # fmt: skip
@@ -69,8 +72,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
         "machine": trained.get("machine") or {},
         "model": os.path.relpath(model, output),
         "options": known and known["options"],
-        "open_ended": (model / folder_of.SCHEDULE).is_file()
-        or dataclasses.replace(run, options=options).iterations is None,
+        "open_ended": (model / SCHEDULE).is_file() or dataclasses.replace(run, options=options).iterations is None,
         "photos": describe_photos(known["options"]) if known else None,
         "page": os.path.relpath(page, output) if record.stage("html") and page.is_file() else None,
         "peak": best,
@@ -185,3 +187,17 @@ def _restore_run(content: dict[str, Any], output: Path) -> tuple[Run, Failure | 
     options, added = tuple(content["options"] or ()), tuple(content["added_options"] or ())
     run = Run(scene, content["config"], content["seed"], output / content["model"], options, added)
     return run, Failure(**content["failure"]) if content["failure"] else None
+
+
+def shorter_ends_there(model: Path, iterations: int) -> bool:
+    """Tell whether a training of so many --iterations ends with the model that a longer one has then.
+
+    False if that is not known, and for so few that SH bands are raised sooner.
+    """
+    if (model / SCHEDULE).is_file() or iterations < SH_INTERVAL:
+        return False
+    try:
+        options = read_stored_options(model)
+    except UserError:
+        return False
+    return not any(part.follows_length(argparse.Namespace(**options)) for part in PARTS)

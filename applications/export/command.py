@@ -48,7 +48,7 @@ from scene.splats.spz import WRITTEN
 from scene.with_splats import load_file, model_of, place, splats_of
 from splatting.cleaning import OPTION as CLEAN_OPTION
 from splatting.cleaning import check_clean, clean_scene, write_comparison
-from splatting.registry import tools
+from splatting.registry import PARTS
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device
 
@@ -127,7 +127,7 @@ def thin_out(
 def find_sky(model: str | None, means: np.ndarray) -> np.ndarray:
     """Return a mask (N,) of the Gaussians with centres (N, 3) that are a model's sky. UserError without a sky."""
     facts = read_model_json(Path(model)) if model else {}
-    found = [mask for backdrop in tools("backdrop") if (mask := backdrop(facts, torch.from_numpy(means))) is not None]
+    found = [mask for part in PARTS if (mask := part.backdrop(facts, torch.from_numpy(means))) is not None]
     if not found:
         raise UserError("--no_sky needs a model folder (-m) that was trained with a sky; leave it out")
     return found[0].numpy()

@@ -14,6 +14,7 @@ from nerfbaselines import Method
 
 from applications.nerfbaselines.datasets import has_white_background, in_place_of_files, scene_of, view_of
 from arguments import write_cfg_args, write_model_json
+from arguments.features import FEATURES, appearances
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.files.json_files import read_json, write_json
 from scene.cameras import Camera
@@ -25,7 +26,7 @@ from splatting.iteration import Iteration
 from splatting.loop import training_steps
 from splatting.part import Part
 from splatting.records import training_log
-from splatting.registry import PARTS, appearances, part_class
+from splatting.registry import PARTS
 from splatting.run import Run
 from splatting.watch import MaskWatch
 from utils.system_utils import UserError, compute_device, saved_ply
@@ -34,14 +35,13 @@ RECORD = "nerfbaselines.json"  # in a checkpoint: its step, and the options that
 INTERVAL = 100  # iterations between losses that are told: reading one waits for the GPU
 # Test views are held out by NerfBaselines. Full-size photos, no viewer, and nothing written but by `save`.
 _ALWAYS = ("--eval", "--resolution=1", "--disable_viewer", "--no_curve", "--test_iterations=-1", "--save_iterations=-1")
-_PARTS = [part_class(name) for name in PARTS]
 _OF_FILES = ("appearance", "init_ply", "masks", *(kind.flag for kind in appearances() if kind.flag))
-_OF_FILES += tuple(part.name for part in _PARTS if part.needs.files)
+_OF_FILES += tuple(part.name for part in PARTS if part.needs.files)
 # Options that nothing follows here, with the value that is the case. Our other observers score, save and show.
 _FIXED = dict.fromkeys(
     ("advise", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "keep_unseen", "prune_sh",
-     *(name for part in _PARTS if part.told_last for name in part.options.by_name))
+     *(name for part in PARTS if part.told_last for name in FEATURES[part.name].by_name))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true",
      "holdout": "every8"}  # fmt: skip

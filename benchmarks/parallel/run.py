@@ -12,11 +12,12 @@ from scene.gaussians.morton import sort_rows
 from scene.in_view import share_in_view
 from scene.sleeping import Sleeping
 from splatting.commands import train
-from splatting.features.spill import sentences
+from splatting.features.sleep import Sleep
+from splatting.features.spill import Spill, sentences
 from splatting.iteration import ViewOrder
 from splatting.objective import LossWatch, Objective
 from splatting.records.training_log import Stopwatch
-from splatting.registry import part_class, strategy_part
+from splatting.registry import strategy_part
 from splatting.run import Run
 from splatting.schedule import Schedule
 from splatting.watch import DivergenceWatch
@@ -53,7 +54,7 @@ class WorkloadRun(Run):
         )
         self.scene.getTrainCameras = lambda: cameras
         if gpu_memory:
-            self.parts = [part_class("spill")()]
+            self.parts = [Spill()]
             self.parts[0].check(self, None)
             self.gaussians.storage.reserve(-(-workload.gaussians // self.group.size), self.scene)
         self._begin(workload)
@@ -68,7 +69,7 @@ class WorkloadRun(Run):
         if sleep:
             sort_rows(self.gaussians)
             self.sleeping = Sleeping(self.gaussians)
-            keeps = part_class("sleep")()
+            keeps = Sleep()
             keeps.begin(self, None)
             self.parts = [*self.parts, keeps]
 

@@ -9,7 +9,6 @@ from groundwork.finding import Finding, fine, from_error
 from scene.dataset_readers import CameraInfo, SceneInfo
 from scene.readers.tracks import Track, rays_to, read_tracks
 from scene.reprojection import BOUND, nearest_pose, pull
-from splatting.registry import tools
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
@@ -23,6 +22,7 @@ _AGREEING = 0.9  # share of the photos
 _BENT = 2.0  # times the error of pairs alone, that a model's poses may have
 _WRONG = 5.0  # pixels, beyond which poses are wrong even if no better ones are near
 _ADJUST = "adjust the model again (COLMAP: bundle_adjuster)"
+REFINE = "train with --refine_poses"  # where other poses would fit far better
 
 
 def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
@@ -99,10 +99,9 @@ def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], ext
     given, best = found
     text = f"points lie {given:.2g} pixels from where photos show them (median)"
     if poses_differ(given, best):
-        remedies = [*(remedy(True) for remedy in tools("for_wrong_poses")), _ADJUST]
-        yield Finding(f"{text}, and {best:.2g} with better poses", ", or ".join(remedies))
+        yield Finding(f"{text}, and {best:.2g} with better poses", f"{REFINE}, or {_ADJUST}")
     elif given > _WRONG:
-        yield Finding(text, "; ".join([_ADJUST, *(remedy(False) for remedy in tools("for_wrong_poses"))]))
+        yield Finding(text, f"{_ADJUST}; --refine_poses corrects 3 degrees at most")
 
 
 def check_agreement(folder: Path) -> Iterator[Finding]:

@@ -19,7 +19,7 @@ from splatting.agreement import agree_on_options
 from splatting.events import summary_writer
 from splatting.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
 from splatting.loop import run_training, standard_observers
-from splatting.registry import check_together, chosen, tools
+from splatting.registry import PARTS, check_together, chosen
 from splatting.run import Run
 from splatting.scores import training_report
 from utils.general_utils import safe_state
@@ -35,7 +35,8 @@ def train(
 
     launch: the options of arguments/launch.py.
     """
-    if not all([prepare(dataset, opt, launch) for prepare in tools("prepare")]):
+    stops = {option: continues for part in PARTS for option, continues in part.ends_by.items()}
+    if not all([part.prepare(dataset, opt, launch, stops) for part in PARTS]):
         return
     dataset.model_path = dataset.model_path or folder_of(launch.start_checkpoint) or new_folder(dataset.source_path)
     run = Run(dataset, opt, pipe, launch)

@@ -4,14 +4,14 @@ import argparse
 import copy
 import sys
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option, above
-from splatting.part import Options, Strategy
-
-if TYPE_CHECKING:
-    from scene.gaussians.density_rules import Actions
-    from splatting.iteration import Iteration
+from scene.gaussians import density_rules
+from scene.gaussians.adc import refuse_empty
+from scene.gaussians.density_rules import Actions
+from scene.gaussians.morton import sort_rows
+from splatting.iteration import Iteration
+from splatting.part import Strategy
 
 
 class Adc(Strategy):
@@ -22,17 +22,6 @@ class Adc(Strategy):
     """
 
     name = "adc"
-    summary = "adaptive density control of the 3DGS paper"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("absgrad", False, origin="ours",
-            help="adc: densify by absolute gradients of the pixels (AbsGS), which do not cancel out where a large "
-                 "Gaussian covers fine detail; --absgrad_threshold then replaces --densify_grad_threshold"),
-        Option("absgrad_threshold", 0.0008, origin="ours, as gsplat recommends", check=above(0),
-            help="adc: absolute screen-space gradient (per NDC unit) that makes a Gaussian clone or split, with "
-                 "--absgrad; lower: more Gaussians"),
-    ))
-    # fmt: on
     fusable = True
     grows_to = False
 
@@ -42,8 +31,6 @@ class Adc(Strategy):
 
     def begin(self, run: Any, state: Any) -> None:
         """Where a part allows no resets, opacities are reset at an interval that is given, or never."""
-        from scene.gaussians import density_rules
-
         super().begin(run, state)
         opt, self._white_background = run.opt, run.dataset.white_background
         usual = opt.opacity_reset_interval == density_rules.USUAL_RESETS
@@ -79,13 +66,13 @@ class Adc(Strategy):
             return self._gaussians._attributes
         return ["opacity"] if self.resets(iteration) else ()
 
-    def after_backward(self, at: "Iteration", package: dict[str, Any]) -> None:
+    def after_backward(self, at: Iteration, package: dict[str, Any]) -> None:
         if self.observes(at.iteration):
             observe = self._gaussians.observe_absolute if self.absolute_gradients else self._gaussians.observe
             observe(package["viewspace_points"], package["radii"])
         self.change_rows(at)
 
-    def change_rows(self, at: "Iteration") -> None:
+    def change_rows(self, at: Iteration) -> None:
         todo = self._actions(at.iteration)
         if todo.densify:
             self.densify(at.iteration, todo.limit_size)
@@ -98,15 +85,12 @@ class Adc(Strategy):
         left = (schedule.length - step) / schedule.stride(iteration)
         return schedule.paced and left < self._rules.RECOVERY
 
-    def _actions(self, iteration: int) -> "Actions":
+    def _actions(self, iteration: int) -> Actions:
         place = self.schedule.span(iteration), self.schedule.stride(iteration)
         return self._rules.actions(iteration, self._opt, self._white_background, *place)
 
     def densify(self, iteration: int, limit_size: bool) -> None:
         """Clone, split and prune by the statistics, which start anew. limit_size: prune what is large on screen."""
-        from scene.gaussians.adc import refuse_empty
-        from scene.gaussians.morton import sort_rows
-
         gaussians, most = self._gaussians, self.max_gaussians
         gaussians.densify_and_prune(
             self.threshold,

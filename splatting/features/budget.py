@@ -10,17 +10,19 @@ constant. Adam averages squared gradients over fewer iterations, and SH bands le
 
 import math
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option, within
-from splatting.part import Options, Strategy
+from torch import Tensor
+
+from groundwork.deterministic.counter_rng import Stream, permutation
+from scene.cameras import Camera
+from scene.gaussians.adc import refuse_empty, remove_useless
+from scene.gaussians.density_rules import band_rate, default_budget, interval
+from scene.gaussians.morton import sort_rows
+from splatting.features.budget_rules import error_scores, fade, split_in_two
+from splatting.iteration import Iteration
+from splatting.part import Strategy
 from splatting.schedule import longer_steps
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from scene.cameras import Camera
-    from splatting.iteration import Iteration
 
 SQUARES = 0.005  # 1 - beta2 of Adam in USUAL iterations; the paper has 0.001
 LEAST_AVERAGED = 16  # iterations, over which squared gradients are averaged in any case
@@ -35,30 +37,15 @@ class Budget(Strategy):
     """
 
     name = "budget"
-    summary = (
-        "grows to --max_num_splats Gaussians where the error is largest (0: one for 64 training pixels, 100,000 to "
-        "1,000,000)"
-    )
     removes = True
     fusable = True
     clamps = False
-    # fmt: off
-    options = Options(optimisation=(
-        Option("opacity_decay", 0.98, origin="ours", check=within(0.5, 1),
-            help="budget: factor of all opacities after each densification, so that unneeded Gaussians fade; 1: off"),
-        Option("prune_opacity", 0.005, origin="ours, and adaptive density control's", check=within(0, 0.5),
-            help="budget: remove Gaussians of a lower opacity, every --densification_interval steps"),
-    ))
-    # fmt: on
 
     @classmethod
     def best_in(cls, seconds: float, run: Any) -> bool:
         return True
 
     def begin(self, run: Any, state: Any) -> None:
-        from scene.gaussians.density_rules import band_rate, default_budget
-        from splatting.features.budget_rules import error_scores
-
         super().begin(run, state)
         self._gaussians, self._opt, self._cameras = run.gaussians, run.opt, run.scene.getTrainCameras()
         self.ends = run.opt.densify_until_iter
@@ -78,13 +65,9 @@ class Budget(Strategy):
         in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter
         return in_time and iteration % self._interval(iteration) == 0
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         if not self.changes(at.iteration):
             return
-        from scene.gaussians.adc import refuse_empty, remove_useless
-        from scene.gaussians.morton import sort_rows
-        from splatting.features.budget_rules import fade, split_in_two
-
         grows = self._grows(at.iteration)
         aim = now = self._gaussians.gaussian_count
         if grows:
@@ -124,21 +107,15 @@ class Budget(Strategy):
         return max(math.ceil(ahead) - 1, 0)
 
     def _interval(self, iteration: int) -> int:
-        from scene.gaussians.density_rules import interval
-
         return interval(self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration))
 
-    def _chosen(self, at: "Iteration", count: int) -> "Tensor":
+    def _chosen(self, at: Iteration, count: int) -> Tensor:
         """Indices of this process's Gaussians to split, ascending; those of all processes are at most `count`."""
-        from groundwork.deterministic.counter_rng import Stream
-
         scores = self._scores(self._scored_views(at.iteration), at.background)
         numbers = {"seed": self._opt.seed, "stream": Stream.DENSIFY, "iteration": at.iteration}
         return self._gaussians.shards.choose(scores, count, **numbers)
 
-    def _scored_views(self, iteration: int) -> "list[Camera]":
-        from groundwork.deterministic.counter_rng import Stream, permutation
-
+    def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
         count = SCORED_VIEWS
         if self.schedule.stride(iteration) > 1:  # few iterations, of which scores shall not take the time

@@ -1,41 +1,29 @@
 """The curve of error against run time, recorded while the model trains: error_vs_time.csv and .png."""
 
+import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option
-from splatting.part import Error, Options, Part
-
-if TYPE_CHECKING:
-    import argparse
-
-    from gaussian_renderer.scored_views import ScoredViews
-    from scene.cameras import Camera
-    from splatting.iteration import Iteration, Losses
+from gaussian_renderer.scored_views import ScoredViews
+from scene.cameras import Camera
+from splatting.iteration import Iteration, Losses
+from splatting.part import Error, Part
+from splatting.records.curve_recorder import CurveRecorder, evenly_spread
+from utils.system_utils import saved_iterations
 
 
 class Curve(Part):
     """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
 
     name = "curve"
-    # fmt: off
-    options = Options(launch=(
-        Option("no_curve", False, origin="ours", topic="output",
-            help="do not write error_vs_time.csv and .png; with --eval they cost up to 5 % of the time, more in short "
-                 "runs"),
-    ))
-    # fmt: on
     _recorder: Any = None
 
     @classmethod
-    def wanted(cls, given: "argparse.Namespace") -> bool:
+    def wanted(cls, given: argparse.Namespace) -> bool:
         return not getattr(given, "no_curve", False)
 
     def opened(self, run: Any) -> None:
-        from gaussian_renderer.scored_views import ScoredViews
-        from splatting.records.curve_recorder import CurveRecorder, evenly_spread
-
         self._run, test = run, run.scene.getTestCameras()
         if not test:
             return
@@ -56,12 +44,12 @@ class Curve(Part):
         self._due = False
         self._seconds = 0.0
 
-    def _load(self, cameras: "Sequence[Camera]", views: "ScoredViews") -> None:
+    def _load(self, cameras: Sequence[Camera], views: ScoredViews) -> None:
         self._run.scene.prefetch(cameras)
         for camera in cameras:
             views.load(camera)
 
-    def due(self, at: "Iteration") -> bool:
+    def due(self, at: Iteration) -> bool:
         if self._recorder is None:
             return False
         run = self._run
@@ -69,7 +57,7 @@ class Curve(Part):
         self._due = self._recorder.due(at.span, first, run.clock.seconds, run.schedule.expected)
         return self._due
 
-    def measured(self, at: "Iteration", losses: "Losses") -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         if self._recorder is not None and (self._due or at.last):
             self._seconds = at.scored_at = self._run.clock.seconds
             point = self._recorder.point(at.span) or at.span[-1]
@@ -82,8 +70,6 @@ class Curve(Part):
         if error is not None:
             self._recorder.abandon()
             return
-        from utils.system_utils import saved_iterations
-
         run = self._run
         there = saved_iterations(Path(run.scene.model_path) / "point_cloud")
         saved = {*run.schedule.known(run.launch.save_iterations)} & {*there}

@@ -1,53 +1,34 @@
 """Depth maps as supervision (--depths), as in the newest reference: a loss of inverse depth with a falling weight."""
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from pathlib import Path
+from typing import Any
 
-from splatting.option import CFG_ARGS, Option, at_least
-from splatting.part import Needs, Options, Part
+from torch import Tensor
 
-if TYPE_CHECKING:
-    import argparse
-
-    from torch import Tensor
-
-    from scene.cameras import Camera
-    from scene.readers.info import SceneInfo
-    from splatting.iteration import Iteration, Term
+from scene.cameras import Camera
+from scene.dataset_readers import find_reader_replacement
+from scene.readers.depth_maps import with_depth_maps
+from scene.readers.depth_scale import check_maps
+from scene.readers.info import SceneInfo
+from scene.readers.scene_folder import kind_of
+from splatting.iteration import Iteration, Term
+from splatting.part import Needs, Part
+from utils.general_utils import get_expon_lr_func
+from utils.loss_utils import inverse_depth_loss
 
 
 class Depths(Part):
     """Finds the maps of the training photos, and adds their loss for views whose map is reliable."""
 
     name = "depths"
-    # fmt: off
-    options = Options(
-        model=(
-            Option("depths", "", short="d", stored=CFG_ARGS, seen=False, topic="data",
-                help="folder of depth maps inside the scene folder, named like the photos: PNGs of inverse depth, or "
-                     "metric PNGs, .npy or .pfm; they stabilise regions that few photos show"),
-        ),
-        optimisation=(
-            Option("depth_l1_weight_init", 1.0, check=at_least(0), topic="data",
-                help="weight of the depth loss (--depths) at the start"),
-            Option("depth_l1_weight_final", 0.01, check=at_least(0), topic="data",
-                help="weight of the depth loss in the last step"),
-        ),
-    )
-    # fmt: on
     needs = Needs(depth=True, files=True)
 
     @classmethod
-    def follows_length(cls, given: "argparse.Namespace") -> bool:
+    def follows_length(cls, given: argparse.Namespace) -> bool:
         return cls.wanted(given)
 
-    def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
-        from pathlib import Path
-
-        from scene.dataset_readers import find_reader_replacement
-        from scene.readers.depth_maps import with_depth_maps
-        from scene.readers.depth_scale import check_maps
-        from scene.readers.scene_folder import kind_of
-
+    def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         if not fresh or find_reader_replacement(kind_of(args.source_path)):  # which finds the maps itself
             return info
         info = with_depth_maps(info, Path(args.source_path), args.depths)
@@ -55,27 +36,23 @@ class Depths(Part):
         return info
 
     def begin(self, run: Any, state: Any) -> None:
-        from utils.general_utils import get_expon_lr_func
-
         self._schedule, opt = run.schedule, run.opt
         self._unit = 1 / run.gaussians.enlargement  # so that the loss is that of depths as they are drawn
         ends = opt.depth_l1_weight_init, opt.depth_l1_weight_final
         self._weight = get_expon_lr_func(*ends, max_steps=opt.iterations)
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
+    def terms(self, at: Iteration) -> dict[str, Term]:
         weight = self._weight(self._schedule.schedule_step(at.iteration)) if at.camera.depth_reliable else 0.0
         if not weight > 0:
             return {}
         return {"depth": lambda package, mask: weight * self._unit * depth_loss(package["depth"], at.camera, mask)}
 
 
-def depth_loss(inverse_depth: "Tensor", camera: "Camera", mask: "Tensor | None") -> "Tensor":
+def depth_loss(inverse_depth: Tensor, camera: Camera, mask: Tensor | None) -> Tensor:
     """Mean |difference| of an inverse depth (1, H, W) from the camera's map, where the map has a value.
 
     mask: (1, H, W) bool, pixels that count; None: all.
     """
-    from utils.loss_utils import inverse_depth_loss
-
     target = camera.target_inverse_depth
     if camera.depth_has_gaps:
         mask = target > 0 if mask is None else mask & (target > 0)

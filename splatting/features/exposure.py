@@ -3,15 +3,15 @@
 import argparse
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import CFG_ARGS, Option, at_least, within
-from splatting.part import Appearance, Options
-
-if TYPE_CHECKING:
-    from scene.cameras import Camera
-    from scene.readers.info import CameraInfo, SceneInfo
-    from scene.scene import Scene
+from scene.cameras import Camera
+from scene.dataset_readers import find_reader_replacement
+from scene.readers.info import CameraInfo, SceneInfo, names_of_photos, normalization
+from scene.readers.scene_folder import kind_of
+from scene.scene import Scene, load_exposures, save_exposures
+from splatting.part import Appearance
+from utils.image_utils import half
 
 
 class Exposure(Appearance):
@@ -24,39 +24,12 @@ class Exposure(Appearance):
     name = "exposure"
     kind = "affine"
     flag = "train_test_exp"
-    summary = "--train_test_exp"
-    # fmt: off
-    options = Options(
-        model=(
-            Option("train_test_exp", False, stored=CFG_ARGS, compared=False, after="white_background",
-                topic="photos that vary",
-                help="train a colour correction of each photo, for photos of different exposure; the left halves of "
-                     "test photos train too, and only their right halves are scored and rendered"),
-        ),
-        optimisation=(
-            Option("exposure_lr_init", 0.01, check=at_least(0), topic="photos that vary",
-                help="learning rate of exposures (--train_test_exp) at the start"),
-            Option("exposure_lr_final", 0.001, check=at_least(0), topic="photos that vary",
-                help="learning rate of exposures in the last step"),
-            Option("exposure_lr_delay_steps", 0, check=at_least(0), topic="photos that vary",
-                help="steps at the start over which the learning rate of exposures rises to its normal value"),
-            Option("exposure_lr_delay_mult", 0.0, check=within(0, 1), topic="photos that vary",
-                help="factor of the learning rate of exposures at step 0, where that rise begins"),
-        ),
-    )
-    # fmt: on
 
-    def dataset(self, info: "SceneInfo", args: argparse.Namespace, fresh: bool) -> "SceneInfo":
-        from scene.dataset_readers import find_reader_replacement
-        from scene.readers.scene_folder import kind_of
-
+    def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         by_other_code = find_reader_replacement(kind_of(args.source_path))  # which gets the option as an argument
         return info if by_other_code else train_on_all(info)
 
-    def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
-        from scene.readers.info import names_of_photos
-        from utils.image_utils import half
-
+    def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
         scene.halves = True
         names, tested = names_of_photos(scene.info), {view.image_path for view in scene.info.test_cameras}
         for camera, view in cameras:
@@ -70,21 +43,15 @@ class Exposure(Appearance):
         if run.start and state is None:
             print(f"{run.start} has no exposures; all photos start without a correction")
 
-    def save(self, scene: "Scene") -> None:
-        from scene.scene import save_exposures
-
+    def save(self, scene: Scene) -> None:
         save_exposures(scene.gaussians, scene.model_path)
 
-    def load(self, scene: "Scene", args: argparse.Namespace) -> None:
-        from scene.scene import load_exposures
-
+    def load(self, scene: Scene, args: argparse.Namespace) -> None:
         load_exposures(scene)
 
 
-def train_on_all(info: "SceneInfo") -> "SceneInfo":
+def train_on_all(info: SceneInfo) -> SceneInfo:
     """The scene with its test views among the training views, too: sorted by name, or appended if names clash."""
-    from scene.readers.info import normalization
-
     views = info.train_cameras + info.test_cameras
     if len({view.image_name for view in views}) == len(views):
         views.sort(key=lambda view: os.fsencode(view.image_name))

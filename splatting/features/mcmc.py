@@ -7,23 +7,19 @@ what the view sees; and SH bands learn faster from many photos.
 """
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option, at_least, within
-from splatting.part import Options, Strategy
+from scene.gaussians.adc import refuse_empty, remove_useless
+from scene.gaussians.density_rules import FEW_PHOTOS, band_rate, default_budget, interval
+from scene.gaussians.morton import sort_rows
+from scene.gaussians.penalty import Penalty
+from splatting.features.mcmc_rules import add_noise, grow, is_alive, relocate, start_as
+from splatting.iteration import Iteration
+from splatting.part import Strategy
 
-if TYPE_CHECKING:
-    from splatting.iteration import Iteration
-
-_PAPER = "ours, from the MCMC paper"
-_RELEASED = "ours, from the release of the MCMC paper"
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
 SECONDS = 0.25  # for each training photo, at least: 250 iterations on a GPU (docs/guide/strategies.md)
-
-
-def _between(value: float) -> str | None:
-    return None if 0 < value < 1 else "between 0 and 1, and neither of them"
 
 
 class Mcmc(Strategy):
@@ -33,47 +29,20 @@ class Mcmc(Strategy):
     """
 
     name = "mcmc"
-    summary = "moves transparent Gaussians to opaque ones and adds noise to positions"
     until = "mcmc_until_iter", 5 / 6
     fusable = True
     clamps = False
     default_is_limit = True
     queues = True
     seen_only = True
-    # fmt: off
-    options = Options(optimisation=(
-        Option("mcmc_until_iter", 25_000, origin=_RELEASED, check=at_least(0),
-            help="mcmc: relocation and growth end before this step; --densify_until_iter has no effect then"),
-        Option("mcmc_growth", 0.05, origin=_PAPER, check=within(0, 1),
-            help="mcmc: growth in every densification, as a part of the number of Gaussians"),
-        Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_between,
-            help="mcmc: a Gaussian of this opacity or less is moved to another one"),
-        Option("mcmc_noise", 500_000.0, origin=_PAPER, check=within(0, 1e9),
-            help="mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions"),
-        Option("mcmc_opacity_reg", 0.01, origin=_PAPER, check=at_least(0),
-            help="mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved"),
-        Option("mcmc_scale_reg", 0.01, origin=_PAPER, check=at_least(0),
-            help="mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians"),
-        Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_between,
-            help="mcmc: opacity of the Gaussians that are made from points"),
-        Option("mcmc_init_scale", 0.0, origin=_RELEASED, check=at_least(0),
-            help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their "
-                 "neighbours; 0: 0.1, or 1 in a given time"),
-    ))
-    # fmt: on
 
     @classmethod
     def best_in(cls, seconds: float, run: Any) -> bool:
-        from scene.gaussians.density_rules import FEW_PHOTOS
-
         views = run.scene.getTrainCameras()
         few = len(views) <= FEW_PHOTOS and seconds >= SECONDS * len(views)
         return few and run.device.type == "cuda"
 
     def begin(self, run: Any, state: Any) -> None:
-        from scene.gaussians.density_rules import band_rate, default_budget
-        from scene.gaussians.penalty import Penalty
-
         super().begin(run, state)
         self._gaussians, opt = run.gaussians, run.opt
         self._opt, self.ends = opt, opt.mcmc_until_iter
@@ -93,14 +62,10 @@ class Mcmc(Strategy):
 
     def started(self) -> None:
         """Make Gaussians more opaque and smaller than those of adaptive density control (as the authors' release)."""
-        from splatting.features.mcmc_rules import start_as
-
         scale = self._opt.mcmc_init_scale or INIT_SCALES[self.schedule.paced]
         start_as(self._gaussians, self._opt.mcmc_init_opacity, scale)
 
     def changes(self, iteration: int) -> bool:
-        from scene.gaussians.density_rules import interval
-
         opt = self._opt
         within = opt.densify_from_iter < self.schedule.schedule_step(iteration) < opt.mcmc_until_iter
         stride = self.schedule.stride(iteration)
@@ -114,8 +79,6 @@ class Mcmc(Strategy):
 
     def skips_step(self, iteration: int) -> Collection[str]:
         """All, unless there is nothing to do: then the Gaussians take their step."""
-        from splatting.features.mcmc_rules import is_alive
-
         gaussians, least = self._gaussians, self._opt.mcmc_min_opacity
         if not self.changes(iteration):
             return ()
@@ -124,16 +87,13 @@ class Mcmc(Strategy):
         moves = moves or gaussians.shards.ranks.any_rank(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
-    def change_rows(self, at: "Iteration") -> None:
+    def change_rows(self, at: Iteration) -> None:
         if self.changes(at.iteration):
             self._relocate(at.iteration)
             self._grow(at.iteration)
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
-        from scene.gaussians.morton import sort_rows
-        from splatting.features.mcmc_rules import add_noise
-
         if self.changes(at.iteration):
             sort_rows(self._gaussians)
         factor = self._gaussians.enlargement**2  # as covariances have the square of the unit
@@ -142,9 +102,6 @@ class Mcmc(Strategy):
 
     def _relocate(self, iteration: int) -> None:
         """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`count_limit`)."""
-        from scene.gaussians.adc import refuse_empty, remove_useless
-        from splatting.features.mcmc_rules import relocate
-
         least = self._opt.mcmc_min_opacity
         count = self._gaussians.gaussian_count
         if 0 < (most := self._limit(iteration, count, 0)) < count:
@@ -155,8 +112,6 @@ class Mcmc(Strategy):
 
     def _grow(self, iteration: int) -> None:
         """Grow to `_grown`."""
-        from splatting.features.mcmc_rules import grow
-
         count = self._gaussians.gaussian_count
         new = self._grown(count, iteration) - count
         if new > 0:

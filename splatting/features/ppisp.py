@@ -2,24 +2,29 @@
 
 import argparse
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaussian_renderer import photo_name, render
+from gaussian_renderer.scored_views import ScoredViews
+from groundwork.files.json_files import read_model_json
 from groundwork.finding import Finding, note
+from scene.cameras import Camera
+from scene.gaussian_model import GaussianModel
+from scene.images.exposures import EXPOSURES
+from scene.images.exposures import exposures as by_points
+from scene.readers.info import CameraInfo, names_of_photos
+from scene.readers.tracks import Track
+from scene.scene import Scene
+from splatting.features.ppisp_appearance import UNTRAINED, PhotoAppearance, appearance_of, read_appearance
+from splatting.iteration import Iteration, Term
 from splatting.part import Appearance, Needs, Scored, fill
+from splatting.records.renders import FITTED
+from utils.image_utils import as_float, half
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    import numpy as np
-    from torch import Tensor
-
-    from gaussian_renderer.scored_views import ScoredViews
-    from scene.cameras import Camera
-    from scene.gaussian_model import GaussianModel
-    from scene.readers.info import CameraInfo
-    from scene.readers.tracks import Track
-    from scene.scene import Scene
-    from splatting.features.ppisp_appearance import PhotoAppearance
-    from splatting.iteration import Iteration, Term
 
 _RECORDED = "appearance"  # option in model.json, of a training that has one
 
@@ -28,16 +33,9 @@ class Ppisp(Appearance):
     """Trains the numbers of photos and of their cameras. Haze can grow before cameras after a reset of opacities."""
 
     name = kind = "ppisp"
-    summary = (
-        "exposure and white balance of each photo, vignetting and response of each camera, with the test photos held "
-        "out, and without resets of opacities at their usual interval"
-    )
     needs = Needs(captured=True, resets=False)
 
-    def cameras(self, scene: "Scene", cameras: "Sequence[tuple[Camera, CameraInfo]]", held_out: bool) -> None:
-        from scene.readers.info import names_of_photos
-        from splatting.features.ppisp_appearance import UNTRAINED
-
+    def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
         names = names_of_photos(scene.info)
         for camera, view in cameras:
             if held_out:
@@ -46,8 +44,6 @@ class Ppisp(Appearance):
                 camera.exposure_name = name
 
     def begin(self, run: Any, state: Any) -> None:
-        from splatting.features.ppisp_appearance import appearance_of
-
         views = run.scene.info.train_cameras
         if len(views) < 2:
             raise UserError("--appearance ppisp needs at least two training photos; leave it out")
@@ -60,46 +56,42 @@ class Ppisp(Appearance):
             else:
                 self.photos.restore(state)
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
-        from gaussian_renderer import photo_name
-
+    def terms(self, at: Iteration) -> dict[str, Term]:
         return {"appearance": lambda *_: self.photos.pull(photo_name(at.camera))}
 
-    def save(self, scene: "Scene") -> None:
+    def save(self, scene: Scene) -> None:
         scene.gaussians.save_exposures(scene.model_path)
 
-    def load(self, scene: "Scene", args: argparse.Namespace) -> None:
+    def load(self, scene: Scene, args: argparse.Namespace) -> None:
         """Photos of another scene, and of a model that was trained without, have nothing trained."""
-        from groundwork.files.json_files import read_model_json
-        from splatting.features.ppisp_appearance import PhotoAppearance, read_appearance
-
         own = not getattr(args, "other_scene", "") and _RECORDED in read_model_json(args.model_path)
         views = scene.info.train_cameras
         photos = read_appearance(args.model_path, views) if own else PhotoAppearance()
         fill(scene.gaussians, "exposures", photos, self)
 
-    def scored(self, scene: "Scene", pipe: argparse.Namespace, background: Any) -> dict[str, Scored]:
-        from splatting.features.ppisp_appearance import PhotoAppearance
-        from splatting.records.renders import FITTED
-
+    def scored(self, scene: Scene, pipe: argparse.Namespace, background: Any) -> dict[str, Scored]:
         photos = getattr(scene.gaussians, "exposures", None)  # a model of other code may have none
         if not isinstance(photos, PhotoAppearance):
             return {}
         return {FITTED: (fitted_views(photos, pipe, background), scene.getTestCameras())}
 
+    @staticmethod
+    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+        """Measure how far the exposures of the photos differ."""
+        if any(tracks):
+            cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
+            spread = float(exposures(cameras, tracks).std())
+            asked = "--appearance ppisp" if spread > EXPOSURES else ""
+            yield note(f"exposures of the photos differ by {spread:.2f} stops", asked)
 
-def fitted_views(photos: "PhotoAppearance", pipe: argparse.Namespace, background: "Tensor") -> "ScoredViews":
+
+def fitted_views(photos: PhotoAppearance, pipe: argparse.Namespace, background: Tensor) -> ScoredViews:
     """Right halves of held-out views, with their photos' exposure and balance from the left ones.
 
     The trained numbers stay as they are (the protocol of Martin-Brualla et al. 2021, NeRF in the Wild).
     """
-    import torch
 
-    from gaussian_renderer import render
-    from gaussian_renderer.scored_views import ScoredViews
-    from utils.image_utils import as_float, half
-
-    def draw(camera: "Camera", gaussians: "GaussianModel") -> "Tensor":
+    def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
         options = {"want_depth": False, "want_visibility": False, "clamp": False}
         image = render(camera, gaussians, pipe, background, **options)["render"]
         target, mask = camera.ground_truth(background)
@@ -111,24 +103,8 @@ def fitted_views(photos: "PhotoAppearance", pipe: argparse.Namespace, background
     return ScoredViews(pipe, background, True, draw)
 
 
-def advise(scene: "Scene", tracks: "Sequence[Track | None]") -> Iterator[Finding]:
-    """Whether the exposures of the photos differ."""
-    from scene.images.exposures import EXPOSURES
-
-    if any(tracks):
-        cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
-        spread = float(exposures(cameras, tracks).std())
-        asked = "--appearance ppisp" if spread > EXPOSURES else ""
-        yield note(f"exposures of the photos differ by {spread:.2f} stops", asked)
-
-
-def exposures(cameras: "list[Camera]", tracks: "list[Track | None]") -> "np.ndarray":
+def exposures(cameras: list[Camera], tracks: list[Track | None]) -> np.ndarray:
     """Exposures (K,) in stops around their mean, of the photos that have a track."""
-    import torch
-
-    from scene.images.exposures import exposures as by_points
-    from utils.image_utils import as_float
-
     colors, points = [], []
     for track, camera in zip(tracks, cameras, strict=True):
         if track is None:

@@ -1,24 +1,25 @@
 """Poses that are trained with the Gaussians (--refine_poses): a small correction of each training camera's."""
 
+import argparse
 import copy
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from groundwork.files.json_files import MODEL_JSON, read_json, write_json
+import numpy as np
+
+from groundwork.files.json_files import read_json, write_json
 from groundwork.finding import Finding, note
-from splatting.option import Option
-from splatting.part import Needs, Options, Part, Scored, fill
+from scene.cameras import Camera
+from scene.checks.fit import pose_errors, poses_differ
+from scene.readers.info import CameraInfo, SceneInfo
+from scene.readers.tracks import Track
+from scene.scene import Scene
+from splatting.features.refine_poses_steps import PoseRefinement
+from splatting.part import Needs, Part, Scored, fill
+from splatting.records.renders import GIVEN_POSES
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    import argparse
-
-    from scene.cameras import Camera
-    from scene.readers.info import CameraInfo, SceneInfo
-    from scene.readers.tracks import Track
-    from scene.scene import Scene
 
 NAME = "poses.json"
 _WITHOUT = "write refine_poses=false into model.json to render from the dataset's poses"
@@ -29,27 +30,18 @@ class RefinePoses(Part):
     """Gives the cameras their poses, which take steps on the host, and keeps them in poses.json."""
 
     name = "refine_poses"
-    # fmt: off
-    options = Options(model=(
-        Option("refine_poses", False, origin="ours", stored=MODEL_JSON, topic="cameras",
-            help="correct the pose of each training camera together with the Gaussians, by at most 3 degrees; needs "
-                 "the tracks of a COLMAP scene"),
-    ))
-    # fmt: on
     needs = Needs(files=True)
     against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
 
     @classmethod
-    def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
+    def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
         raise UserError(f"{given.start_checkpoint} was trained with --{cls.name}; give that option")
 
-    def dataset(self, info: "SceneInfo", args: "argparse.Namespace", fresh: bool) -> "SceneInfo":
+    def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         self._elsewhere = bool(getattr(args, "other_scene", ""))
         return info if fresh or self._elsewhere else with_poses(info, args.model_path)
 
     def begin(self, run: Any, state: Any) -> None:
-        from splatting.features.refine_poses_steps import PoseRefinement
-
         self.poses = PoseRefinement(run.scene, run.dataset.source_path, run.opt.iterations)
         if run.start:
             self.poses.restore(state)
@@ -65,24 +57,29 @@ class RefinePoses(Part):
     def state(self) -> dict[str, Any]:
         return self.poses.captured()
 
-    def scored(self, scene: "Scene", pipe: "argparse.Namespace", background: Any) -> dict[str, Scored]:
+    def scored(self, scene: Scene, pipe: argparse.Namespace, background: Any) -> dict[str, Scored]:
         """Test views as the dataset has them."""
-        from splatting.records.renders import GIVEN_POSES
-
         views = [] if self._elsewhere else [copy.copy(camera) for camera in scene.getTestCameras()]
         for camera in views:
             given = scene.given_test_views[camera.uid]
             camera.place(given.R, given.T)
         return {GIVEN_POSES: (None, views)} if views else {}
 
-    def save(self, scene: "Scene") -> None:
+    def save(self, scene: Scene) -> None:
         write_poses(scene.model_path, scene.getTrainCameras(), scene.getTestCameras())
 
+    @staticmethod
+    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+        """Measure whether tracks ask for other poses."""
+        found = pose_errors(scene.info.train_cameras, tracks, scene.cameras_extent) if any(tracks) else None
+        if found is not None:
+            given, best = found
+            text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better"
+            yield note(f"{text} poses", "--refine_poses" if poses_differ(given, best) else "")
 
-def write_poses(folder: str | os.PathLike, train: "Sequence[Camera]", test: "Sequence[Camera]") -> None:
+
+def write_poses(folder: str | os.PathLike, train: Sequence[Camera], test: Sequence[Camera]) -> None:
     """Write the poses of both lists of cameras, in the dataset's order: names, and R and T as `Camera` has them."""
-    import numpy as np
-
     lists = {"train": train, "test": test}
     table = {
         name: [
@@ -94,7 +91,7 @@ def write_poses(folder: str | os.PathLike, train: "Sequence[Camera]", test: "Seq
     write_json(Path(folder) / NAME, table)
 
 
-def with_poses(info: "SceneInfo", folder: str | os.PathLike) -> "SceneInfo":
+def with_poses(info: SceneInfo, folder: str | os.PathLike) -> SceneInfo:
     """A dataset with the poses of a model folder's poses.json. UserError for a file that does not fit the dataset."""
     path = Path(folder) / NAME
     try:
@@ -107,9 +104,7 @@ def with_poses(info: "SceneInfo", folder: str | os.PathLike) -> "SceneInfo":
     return info._replace(**{f"{name}_cameras": _placed(views, table.get(name), path) for name, views in lists.items()})
 
 
-def _placed(views: "Sequence[CameraInfo]", entries: Any, path: Path) -> "list[CameraInfo]":
-    import numpy as np
-
+def _placed(views: Sequence[CameraInfo], entries: Any, path: Path) -> list[CameraInfo]:
     names = [view.image_name for view in views]
     try:
         if [entry["img_name"] for entry in entries] != names:
@@ -122,19 +117,3 @@ def _placed(views: "Sequence[CameraInfo]", entries: Any, path: Path) -> "list[Ca
     if any("lens" in entry for entry in entries):
         raise UserError(f"{path} has refined lenses, which this version does not support; {_WITHOUT}")
     return [view._replace(R=R, T=T) for view, (R, T) in zip(views, poses, strict=True)]
-
-
-def advise(scene: "Scene", tracks: "Sequence[Track | None]") -> Iterator[Finding]:
-    """Whether tracks ask for other poses."""
-    from scene.checks.fit import pose_errors, poses_differ
-
-    found = pose_errors(scene.info.train_cameras, tracks, scene.cameras_extent) if any(tracks) else None
-    if found is not None:
-        given, best = found
-        text = f"points lie {given:.2g} pixels from where photos show them (median), and {best:.2g} with better poses"
-        yield note(text, "--refine_poses" if poses_differ(given, best) else "")
-
-
-def for_wrong_poses(best: bool) -> str:
-    """What to do where points are not where photos show them. best: other poses would fit far better."""
-    return "train with --refine_poses" if best else "--refine_poses corrects 3 degrees at most"

@@ -1,17 +1,18 @@
 """The remote viewer of the reference (--ip, --port, --disable_viewer), by gaussian_renderer/network_gui.py."""
 
 import argparse
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option
-from splatting.part import Error, Options, Part
+import torch
+from torch import Tensor
 
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gaussian_renderer.network_message import Request
-    from scene.gaussian_model import GaussianModel
-    from splatting.iteration import Iteration, Losses
+from gaussian_renderer import network_gui, render
+from gaussian_renderer.network_message import Request
+from gaussian_renderer.network_transfer import ViewerLost
+from scene.gaussian_model import GaussianModel
+from splatting.iteration import Iteration, Losses
+from splatting.part import Error, Part
+from utils.system_utils import first_line
 
 _TICK = 0.1  # seconds between looks whether a signal asks to stop
 _LAST = 1.0  # seconds that a finished training waits for one more request
@@ -25,13 +26,6 @@ class RemoteViewer(Part):
     """
 
     name = "remote_viewer"
-    # fmt: off
-    options = Options(launch=(
-        Option("ip", "127.0.0.1", help="address to listen at for the remote viewer", topic="viewers"),
-        Option("port", 6009, help="port for the remote viewer, 0: any free one", topic="viewers"),
-        Option("disable_viewer", False, called=True, help="open no port for the remote viewer", topic="viewers"),
-    ))
-    # fmt: on
     told_last = True
     _asked = False
 
@@ -40,27 +34,25 @@ class RemoteViewer(Part):
         return True
 
     def begin(self, run: Any, state: Any) -> None:
-        from gaussian_renderer import network_gui
-
         # No process of several can draw a view by itself.
         self.active = not run.group.several and not (run.launch.disable_viewer and network_gui.listener is None)
 
     def opened(self, run: Any) -> None:
-        from gaussian_renderer import network_gui
-
         self._run, self._gui = run, network_gui
         if not run.launch.disable_viewer:
-            ip, port = self.options.launch[:2]
+            from arguments.features import FEATURES
+
+            ip, port = FEATURES[self.name].launch[:2]
             address = run.launch.ip, run.launch.port
             run.resources.enter_context(self._gui.listening(*address, address != (ip.default, port.default)))
 
-    def due(self, at: "Iteration") -> bool:
+    def due(self, at: Iteration) -> bool:
         if self._gui.conn is None:
             self._gui.try_connect()
         self._asked = self._gui.has_request() and not at.last
         return self._asked
 
-    def measured(self, at: "Iteration", losses: "Losses") -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         if self._asked:
             with self._run.clock.paused("viewing"):
                 self._serve(last=False)
@@ -89,8 +81,6 @@ class RemoteViewer(Part):
 
     def _answer(self) -> bool:
         """Answer one request; whether the viewer is still there."""
-        from gaussian_renderer.network_transfer import ViewerLost
-
         try:
             request = self._gui.receive_request()
             frame = None if request is None else self._frame(request)
@@ -99,10 +89,7 @@ class RemoteViewer(Part):
             return False
         return True
 
-    def _frame(self, request: "Request") -> memoryview:
-        from gaussian_renderer.network_transfer import ViewerLost
-        from utils.system_utils import first_line
-
+    def _frame(self, request: Request) -> memoryview:
         run = self._run
         try:
             return frame_bytes(request, run.gaussians, run.pipe, run.background)
@@ -112,17 +99,11 @@ class RemoteViewer(Part):
             raise ViewerLost(fault) from error
 
 
-def frame_bytes(
-    request: "Request", gaussians: "GaussianModel", pipe: argparse.Namespace, background: "Tensor"
-) -> memoryview:
+def frame_bytes(request: Request, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> memoryview:
     """RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
 
     pipe: options of the training, which stay as they are; for the frame, the request's two switches count instead.
     """
-    import torch
-
-    from gaussian_renderer import render
-
     switches = {"convert_SHs_python": request.shs_python, "compute_cov3D_python": request.rot_scale_python}
     camera, pipe = request.camera(background.device), argparse.Namespace(**vars(pipe) | switches)
     options = {"want_depth": False, "want_visibility": False}

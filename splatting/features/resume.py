@@ -3,26 +3,25 @@
 A note in model.json says that a training has reached its end: only then all of its files are complete.
 """
 
+import argparse
 import contextlib
 import math
 import os
 import shlex
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
+
+from tqdm import tqdm
 
 from groundwork.files.json_files import MODEL_JSON, read_model_json
-from splatting.option import MOST_NEEDED, Option
-from splatting.part import Error, Options, Part, fill
-from splatting.registry import PARTS, part_class
+from scene.saved_model import saves_in
+from splatting.iteration import Iteration
+from splatting.part import Error, Part, fill
 from splatting.schedule import STEADY
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    import argparse
-
-    from splatting.iteration import Iteration
 
 FINISHED, MORE = "finished", "continued_by"  # entries of model.json: the last iteration, and the option for more
 
@@ -42,18 +41,9 @@ class Resume(Part):
 
     name = "resume"
     told_last = True  # after the checkpoints that were asked for
-    # fmt: off
-    options = Options(launch=(
-        Option("resume", False, origin="ours", topic=MOST_NEEDED,
-            help="resume in -m, or start there, and write checkpoints for the next --resume"),
-        Option("no_last_checkpoint", False, origin="ours", called=True, topic="output",
-            help="leave no checkpoint at the end. It has 720 MB for a million Gaussians, and --resume continues it "
-                 "with more --iterations or seconds"),
-    ))
-    # fmt: on
 
     @classmethod
-    def wanted(cls, given: "argparse.Namespace") -> bool:
+    def wanted(cls, given: argparse.Namespace) -> bool:
         return True
 
     def begin(self, run: Any, state: Any) -> None:
@@ -91,7 +81,7 @@ class Resume(Part):
         if run.start is None and run.group.first:
             self._file.unlink(missing_ok=True)
 
-    def due(self, at: "Iteration") -> bool:
+    def due(self, at: Iteration) -> bool:
         launch = self._run.launch
         asked = launch.resume and not at.last and at.iteration % EVERY == 0
         self._is_due = asked and self._run.group.broadcast_object(self._has_time())
@@ -102,12 +92,12 @@ class Resume(Part):
         wanted = self._spent + _BYTES * self._run.gaussians.gaussian_count / self._speed
         return seconds >= self._before + LEAST and wanted <= SHARE * seconds
 
-    def _leaves(self, at: "Iteration") -> bool:
+    def _leaves(self, at: Iteration) -> bool:
         """Whether the iteration is the last, and leaves a checkpoint."""
         launch = self._run.launch
         return at.last and not launch.no_last_checkpoint and not at.takes(launch.checkpoint_iterations)
 
-    def stepped(self, at: "Iteration") -> None:
+    def stepped(self, at: Iteration) -> None:
         if at.stopping:
             return
         if self._leaves(at):
@@ -123,15 +113,11 @@ class Resume(Part):
             self._tell(Path(self._run.scene.model_path) / f"chkpnt{at.iteration}.pth")
 
     def _tell(self, last: Path) -> None:
-        from tqdm import tqdm
-
         if self._run.group.first and last.is_file():
             tqdm.write(checkpoint_line(last, self._run.schedule.more), file=sys.stdout)
 
-    def _save(self, at: "Iteration", name: str = "") -> None:
+    def _save(self, at: Iteration, name: str = "") -> None:
         """Write a checkpoint. A disk that is full is told, and ends nothing: nobody has asked for this file."""
-        from tqdm import tqdm
-
         try:
             self._run.checkpoints.save(at, name)
         except UserError as error:
@@ -143,6 +129,31 @@ class Resume(Part):
         if error is None and self._run.group.first:
             note_finished(self._run)
             self._file.unlink(missing_ok=True)
+
+    @classmethod
+    def prepare(
+        cls, dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace, stops: Mapping[str, bool]
+    ) -> bool:
+        """Let --resume name the checkpoint to start with. Returns whether there is anything to train.
+
+        UserError without a folder, and for a finished training that cannot be continued so.
+        """
+        from splatting.folder import folder_of, newest_checkpoint
+
+        if not getattr(launch, "resume", False):
+            return True
+        folder = dataset.model_path or folder_of(launch.start_checkpoint)
+        if not folder:
+            raise UserError("--resume needs -m, the folder whose training it resumes or starts")
+        asked = next((further for name, further in stops.items() if getattr(opt, name)), None)  # None: by --iterations
+        if end := finished(folder):
+            launch.start_checkpoint = str(end.checkpoint)
+            return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
+        most = opt.iterations if asked is None else math.inf
+        launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
+        if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
+            raise UserError(f"{folder} has a model, and no checkpoint to continue; leave --resume out to start over")
+        return True
 
 
 class End(NamedTuple):
@@ -177,31 +188,6 @@ def checkpoint_line(path: Path, more: str) -> str:
     """How to continue a training from its last checkpoint."""
     size = f"{path.stat().st_size / 1e6:.3g} MB"
     return f"Last checkpoint: {shlex.quote(str(path))} ({size}); --resume with {more} continues this training"
-
-
-def prepare(dataset: "argparse.Namespace", opt: "argparse.Namespace", launch: "argparse.Namespace") -> bool:
-    """Let --resume name the checkpoint to start with. Returns whether there is anything to train.
-
-    UserError without a folder, and for a finished training that cannot be continued so.
-    """
-    from scene.saved_model import saves_in
-    from splatting.folder import folder_of, newest_checkpoint
-
-    if not getattr(launch, "resume", False):
-        return True
-    folder = dataset.model_path or folder_of(launch.start_checkpoint)
-    if not folder:
-        raise UserError("--resume needs -m, the folder whose training it resumes or starts")
-    ends = {name: further for part in PARTS for name, further in part_class(part).ends_by.items()}
-    asked = next((further for name, further in ends.items() if getattr(opt, name)), None)  # None: by --iterations
-    if end := finished(folder):
-        launch.start_checkpoint = str(end.checkpoint)
-        return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
-    most = opt.iterations if asked is None else math.inf
-    launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
-    if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
-        raise UserError(f"{folder} has a model, and no checkpoint to continue; leave --resume out to start over")
-    return True
 
 
 def _continued(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:

@@ -1,20 +1,26 @@
 """Masks of what one photo shows and the others do not, such as passers-by (--robust_mask)."""
 
 from collections.abc import Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from torch import Tensor
+
+from gaussian_renderer.scored_views import ScoredViews
 from groundwork.finding import Finding, note
-from splatting.option import Option, within
-from splatting.part import Error, Needs, Options, Part, fill
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from gaussian_renderer.scored_views import ScoredViews
-    from scene.cameras import Camera
-    from scene.scene import Scene
-    from splatting.iteration import Iteration
+from groundwork.host.listing import some
+from scene.cameras import Camera
+from scene.scene import Scene
+from splatting.features.robust_mask_residuals import (
+    FEW,
+    MASKED,
+    MOST_PHOTOS,
+    Residuals,
+    odd_share,
+    residuals_of,
+    write_masks,
+)
+from splatting.iteration import Iteration
+from splatting.part import Error, Needs, Part, fill
 
 
 class RobustMask(Part):
@@ -24,34 +30,25 @@ class RobustMask(Part):
     """
 
     name = "robust_mask"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("robust_mask", 0.0, origin="ours", check=within(0, 0.5), topic="photos that vary",
-            help="largest part of a photo that training may ignore because the other photos do not show it, as with "
-                 "passers-by; 0: off"),
-    ))
-    # fmt: on
     needs = Needs(ranks=False)
 
     def begin(self, run: Any, state: Any) -> None:
-        from splatting.features.robust_mask_residuals import Residuals
-
         self._run = run
         self.residuals = Residuals(run.scene.getTrainCameras(), run.opt.robust_mask, run.device)
         if state is not None:
             self.residuals.restore(state)
         fill(run, "pixel_filter", self, self)
 
-    def mask(self, at: "Iteration", image: "Tensor", target: "Tensor", mask: "Tensor | None") -> "Tensor | None":
+    def mask(self, at: Iteration, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor | None:
         """Pixels that count in a step, of those of a mask; after a reset of opacities, residuals teach nothing."""
         learns = not self._run.strategy.recovers(at.iteration)
         return self.residuals.mask(at.camera, image, target, mask, learns)
 
-    def counted(self, camera: "Camera") -> "Tensor | None":
+    def counted(self, camera: Camera) -> Tensor | None:
         """Pixels of a view that count now."""
         return self.residuals.counted(camera)
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         self.residuals.keep()
 
     def state(self) -> dict[str, Any]:
@@ -59,42 +56,29 @@ class RobustMask(Part):
 
     def ended(self, error: Error) -> None:
         if error is None:
-            from splatting.features.robust_mask_residuals import write_masks
-
             run = self._run
             run.log.tell(write_masks(self.residuals, run.scene.model_path, run.dataset.source_path, run.background))
 
+    @staticmethod
+    def advise_trained(scene: Scene, views: ScoredViews) -> Iterator[Finding]:
+        """Measure what the short training leaves over."""
+        share = odd_share(residuals_of(scene.getTrainCameras(), views, scene.gaussians))
+        text = f"{share:.0%} of the photos have passers-by, reflections or other things that change"
+        text = text if share else "no photo has passers-by, reflections or other things that change"
+        yield note(text, f"--robust_mask {MASKED:g}" if share > FEW else "")
 
-def advise_trained(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
-    """What a short training of small photos leaves over, and the option that it speaks for."""
-    from splatting.features.robust_mask_residuals import FEW, MASKED, odd_share, residuals_of
+    @staticmethod
+    def examine(scene: Scene, views: ScoredViews) -> Iterator[Finding]:
+        """Find photos that show what the model does not."""
+        from arguments import read_training_options
 
-    share = odd_share(residuals_of(scene.getTrainCameras(), views, scene.gaussians))
-    text = f"{share:.0%} of the photos have passers-by, reflections or other things that change"
-    text = text if share else "no photo has passers-by, reflections or other things that change"
-    yield note(text, f"--robust_mask {MASKED:g}" if share > FEW else "")
-
-
-def examine(scene: "Scene", views: "ScoredViews") -> Iterator[Finding]:
-    """Notes on a trained model."""
-    from arguments import read_training_options
-    from groundwork.host.listing import some
-    from splatting.features.robust_mask_residuals import MASKED, MOST_PHOTOS, residuals_of
-
-    cameras = scene.getTrainCameras()
-    taken = bool(read_training_options(scene.model_path).get("robust_mask"))
-    if len(cameras) > MOST_PHOTOS or scene.halves or taken:
-        return
-    masks = residuals_of(cameras, views, scene.gaussians)
-    found = {camera.image_name: masks.counted(camera) for camera in cameras}
-    shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
-    if worst := sorted(shares, key=shares.get, reverse=True):
-        text = f"{len(worst)} of {len(cameras)} photos show what the model does not, such as passers-by or reflections"
-        yield note(f"{text}: most in {some(worst)}", f"--robust_mask {MASKED:g}")
-
-
-def pictures(model: Path) -> list[Path]:
-    """Pictures in a model folder that reports show."""
-    from splatting.features.robust_mask_residuals import PICTURE
-
-    return [model / PICTURE]
+        cameras = scene.getTrainCameras()
+        taken = bool(read_training_options(scene.model_path).get("robust_mask"))
+        if len(cameras) > MOST_PHOTOS or scene.halves or taken:
+            return
+        masks = residuals_of(cameras, views, scene.gaussians)
+        found = {camera.image_name: masks.counted(camera) for camera in cameras}
+        shares = {name: 1 - float(counts.float().mean()) for name, counts in found.items() if counts is not None}
+        if worst := sorted(shares, key=shares.get, reverse=True):
+            text = f"{len(worst)} of {len(cameras)} photos show what the model does not, such as passers-by or"
+            yield note(f"{text} reflections: most in {some(worst)}", f"--robust_mask {MASKED:g}")

@@ -27,7 +27,7 @@ from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.images.find import names_below
 from scene.readers.info import places
-from splatting.records.renders import WIDEST, WORST, sheet
+from splatting.records.renders import MASK_PICTURE, WIDEST, WORST, sheet
 from utils.image_utils import as_float
 from utils.system_utils import UserError, atomic_write
 
@@ -164,13 +164,12 @@ def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
 
 
 FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at the end
-PICTURE = "robust_masks.png"  # photos of which most is left out
 
 
 def write_masks(masks: Residuals, model_path: str | os.PathLike, source_path: str, background: Tensor) -> str:
-    """Write FOLDER and PICTURE into a model folder, in place of those of an earlier training; say what they show."""
+    """Write FOLDER and MASK_PICTURE into a model folder, in place of an earlier training's; say what they show."""
     model, shares = Path(model_path), {}
-    folder, picture = model / FOLDER, model / PICTURE
+    folder, picture = model / FOLDER, model / MASK_PICTURE
     shutil.rmtree(folder, ignore_errors=True)
     picture.unlink(missing_ok=True)
     given = [camera.image_name for camera in masks.cameras]

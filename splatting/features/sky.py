@@ -1,55 +1,49 @@
 """A sky behind all points (--sky): Gaussians on a far sphere that stay there."""
 
+import argparse
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from torch import Tensor
 
 from groundwork.finding import Finding, note
-from splatting.option import Option, one_of
-from splatting.part import Needs, Options, Part, fill
-
-if TYPE_CHECKING:
-    from torch import Tensor
-
-    from scene.readers.tracks import Track
-    from scene.scene import Scene
-    from splatting.iteration import Iteration, Term
+from scene.readers.tracks import Track
+from scene.scene import Scene
+from splatting.features.sky_shell import FEWEST, Shell, find_sky, resumed_shell, said_of_sky, with_shell
+from splatting.iteration import Iteration, Term
+from splatting.part import Needs, Part, fill
 
 
 class Sky(Part):
     """Adds the sky's Gaussians at the start, holds them on their sphere, and asks that nothing stays before them."""
 
     name = "sky"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("sky", "off", origin="ours", check=one_of("off", "auto"), topic="quality and speed",
-            help="auto: add Gaussians on a far sphere in directions that photos show and that have no points; "
-                 "off: add none. Trains in one process, with --strategy adc or budget"),
-    ))
-    # fmt: on
     by_state = True
     needs = Needs(depth=True, ranks=False)
     against = {"strategy=mcmc": "which relocates large Gaussians; use adc or budget"}
     shell = None
 
-    def begin(self, run: Any, state: Any) -> None:
-        from splatting.features import sky_shell as shell
+    @classmethod
+    def wanted(cls, given: argparse.Namespace) -> bool:
+        return getattr(given, "sky", "off") != "off"
 
+    def begin(self, run: Any, state: Any) -> None:
         self._run = run
         if state is not None:
-            self.shell = shell.resumed_shell(state, run.scene)
+            self.shell = resumed_shell(state, run.scene)
         elif run.start:
             print("--sky auto has no effect: the checkpoint has no sky, and only new trainings add one")
         else:
-            self.shell = shell.with_shell(run.scene, run.gaussians)
+            self.shell = with_shell(run.scene, run.gaussians)
         self.active = self.shell is not None
         if self.active:
             fill(run.gaussians, "fixed", self.shell.rows, self)
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
+    def terms(self, at: Iteration) -> dict[str, Term]:
         points = self.shell.at(at.camera, self._run.scene)
         return {"sky": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         if at.changes:
             self.shell.hold(self._run.gaussians)
 
@@ -59,22 +53,15 @@ class Sky(Part):
     def facts(self) -> dict[str, Any]:
         return {self.name: self.shell.captured()}
 
+    @staticmethod
+    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+        """Measure whether photos show a sky."""
+        if len(scene.info.point_cloud.points):
+            _, share = find_sky(scene, Shell.around(scene.info))
+            yield note(said_of_sky(share), "--sky auto" if share >= FEWEST else "")
 
-def advise(scene: "Scene", tracks: "Sequence[Track | None]") -> Iterator[Finding]:
-    """Whether photos show a sky."""
-    from splatting.features.sky_shell import FEWEST, Shell, find_sky, said_of_sky
-
-    if len(scene.info.point_cloud.points):
-        _, share = find_sky(scene, Shell.around(scene.info))
-        yield note(said_of_sky(share), "--sky auto" if share >= FEWEST else "")
-
-
-def backdrop(facts: dict[str, Any], means: "Tensor") -> "Tensor | None":
-    """Which Gaussians are far away, large and opaque by intent, (N,) bool; None: there is no sky.
-
-    facts: of model.json. means: (N, 3) in the model's frame.
-    """
-    from splatting.features.sky_shell import Shell
-
-    state = facts.get("sky")
-    return Shell.restored(state).rows(means) if state else None
+    @staticmethod
+    def backdrop(facts: dict[str, Any], means: Tensor) -> Tensor | None:
+        """Return which Gaussians are far away, large and opaque by intent; None: there is no sky."""
+        state = facts.get("sky")
+        return Shell.restored(state).rows(means) if state else None

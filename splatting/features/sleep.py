@@ -1,13 +1,15 @@
 """Blocks of Gaussians that sleep while no view shows them, and catch up when one may, with the same bytes."""
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
+from scene import sleeping
+from scene.fused_adam import FusedAdam
+from scene.gaussians.adam import GaussianAdam
+from scene.in_view import share_of
+from scene.sleeping import Sleeping
+from splatting.iteration import Iteration
 from splatting.part import Part, fill
-
-if TYPE_CHECKING:
-    import argparse
-
-    from splatting.iteration import Iteration
 
 
 class Sleep(Part):
@@ -16,15 +18,13 @@ class Sleep(Part):
     name = "sleep"
 
     @classmethod
-    def wanted(cls, given: "argparse.Namespace") -> bool:
+    def wanted(cls, given: argparse.Namespace) -> bool:
         return True
 
     def begin(self, run: Any, state: Any) -> None:
         self._run, self._state = run, state
 
     def ready(self, run: Any) -> None:
-        from scene.sleeping import Sleeping
-
         if self._saves():
             sleeping = Sleeping(run.gaussians)
             fill(run, "sleeping", sleeping, self)
@@ -33,11 +33,6 @@ class Sleep(Part):
         self._state = None  # it has rows of the model
 
     def _saves(self) -> bool:
-        from scene import sleeping
-        from scene.fused_adam import FusedAdam
-        from scene.gaussians.adam import GaussianAdam
-        from scene.in_view import share_of
-
         run, strategy = self._run, self._run.strategy
         dense = type(run.gaussians.optimizer) is GaussianAdam and FusedAdam.takes(run.gaussians)
         alone = not (strategy.queues or any(strategy.penalty))
@@ -47,7 +42,7 @@ class Sleep(Part):
             run.group.any_rank(run.gaussians.storage.limit > 0) or share_of(run.scene, run.device) < sleeping.MOST_SHARE
         )
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         if (sleeping := self._run.sleeping) is None:
             return
         self._run.gaussians.optimizer.rows = None

@@ -3,33 +3,23 @@
 Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option, at_least
-from splatting.part import Needs, Options, Part
+from scene.cameras import Camera
+from scene.point_depths import PointDepths, points_of
+from scene.readers.tracks import read_tracks
+from splatting.iteration import Iteration, Term
+from splatting.part import Needs, Part
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    from scene.cameras import Camera
-    from scene.point_depths import PointDepths
-    from splatting.iteration import Iteration, Term
 
 
 class SparseDepth(Part):
     """Adds the depth of a view's points to its loss."""
 
     name = "sparse_depth"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("sparse_depth", 0.0, origin="ours", check=at_least(0), topic="data",
-            help="weight of the loss of depth at the scene's own points (COLMAP only); 0: off"),
-    ))
-    # fmt: on
     needs = Needs(depth=True, ranks=False, files=True)
 
     def begin(self, run: Any, state: Any) -> None:
-        from scene.readers.tracks import read_tracks
-
         source, self._views = run.dataset.source_path, run.scene.info.train_cameras
         self._options = {"weight": run.opt.sparse_depth, "enlargement": run.gaussians.enlargement}
         self._tracks = read_tracks(source, self._views, run.scene.info.offset)
@@ -40,14 +30,12 @@ class SparseDepth(Part):
                 f"{source} has none; leave it out"
             )
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
+    def terms(self, at: Iteration) -> dict[str, Term]:
         points = self._points_of(at.camera)
         return {"points": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
 
-    def _points_of(self, camera: "Camera") -> "PointDepths | None":
+    def _points_of(self, camera: Camera) -> PointDepths | None:
         """The points that train a view, at its size; None if there are none."""
-        from scene.point_depths import points_of
-
         key = camera.uid, camera.image_width, camera.image_height
         if key not in self._known:
             track = self._tracks[camera.uid]

@@ -4,17 +4,20 @@ The limit must begin before the first rows exist, and the most rows of a checkpo
 the part gives the model its room in `check`, while the model is empty, not in `begin`.
 """
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
 
-from splatting.option import Option, within
-from splatting.part import Error, Options, Part, fill
+import torch
+
+from groundwork.host.memory import gib
+from scene import sleeping
+from scene.gaussians.adam import GaussianAdam
+from scene.in_view import share_of
+from splatting.features.spill_memory import GpuMemory, release_torch
+from splatting.iteration import Iteration
+from splatting.part import Error, Part, fill
+from splatting.resources import REMEDY, announce_device, expected_count, warn_of
 from utils.system_utils import UserError
-
-if TYPE_CHECKING:
-    import argparse
-
-    from splatting.features.spill_memory import GpuMemory
-    from splatting.iteration import Iteration
 
 _BUS = 40e9  # bytes a second that kernels read or write in the host's memory
 _SLOW = 10.0  # milliseconds a step, from which on the bus is named
@@ -27,27 +30,17 @@ class Spill(Part):
     """
 
     name = "spill"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("gpu_memory", 0.0, origin="ours", check=within(0, 1_000_000), topic="memory",
-            help="GiB of the GPU's memory that training may use, 0: all. SH bands above 0 and their Adam state that do "
-                 "not fit are kept in the host's memory; slower, with the same result"),
-    ))
-    # fmt: on
 
     @classmethod
-    def wanted(cls, given: "argparse.Namespace") -> bool:
+    def wanted(cls, given: argparse.Namespace) -> bool:
         return True
 
     def check(self, run: Any, state: Any) -> None:
-        from splatting.features.spill_memory import GpuMemory, release_torch
-        from splatting.registry import part_class, strategies
-
         if run.opt.gpu_memory:
             refuse_without_gpu(run.device.type)
         release_torch()  # from the limit of a training that was refused after this
         self._model = run.gaussians
-        absolute = any(part_class(name).takes_absolute(run.opt) for name in strategies())
+        absolute = any(strategy.takes_absolute(run.opt) for strategy in run.strategies)
         fill(self._model, "storage", GpuMemory(run.opt.gpu_memory, self._model, absolute, run.device), self)
 
     def ready(self, run: Any) -> None:
@@ -57,13 +50,11 @@ class Spill(Part):
         announce(run, self._model.storage)
         self._model.storage.rebalance(self._model)
 
-    def after_step(self, at: "Iteration") -> None:
+    def after_step(self, at: Iteration) -> None:
         if at.changes:
             self._model.storage.rebalance(self._model)
 
     def ended(self, error: Error) -> None:
-        from splatting.features.spill_memory import release_torch
-
         release_torch()
 
 
@@ -73,16 +64,11 @@ def refuse_without_gpu(device: str) -> None:
         raise UserError("--gpu_memory limits the memory of a GPU, and there is none to use; leave it out")
 
 
-def announce(run: Any, memory: "GpuMemory") -> None:
+def announce(run: Any, memory: GpuMemory) -> None:
     """Say what lies in the host's memory, now or once there are as many Gaussians as there may be, and what it costs.
 
     Warn if the host has too little for what is expected.
     """
-    from scene import sleeping
-    from scene.gaussians.adam import GaussianAdam
-    from scene.in_view import share_of
-    from splatting.resources import expected_count
-
     now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size
     later = expected_count(most, now)
     if far := memory.host_bytes(-(-later // size)):
@@ -97,11 +83,6 @@ def announce(run: Any, memory: "GpuMemory") -> None:
 
 def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
     """Print what the host has to hold, besides photos there; warn if it does not fit."""
-    import torch
-
-    from groundwork.host.memory import gib
-    from splatting.resources import REMEDY, announce_device, warn_of
-
     host = torch.device("cpu")
     pictures = images.planned_bytes if images.keep_on == host else 0
     each = f" for each of {size} processes" if size > 1 else ""
@@ -110,13 +91,11 @@ def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
         warn_of(host, what, f"set a lower --max_num_splats, or {REMEDY}")
 
 
-def sentences(memory: "GpuMemory", count: int, seen: float, same: bool) -> list[str]:
+def sentences(memory: GpuMemory, count: int, seen: float, same: bool) -> list[str]:
     """What to say before a training of so many Gaussians, of which some are spilled.
 
     seen: the part of them that a step concerns. same: whether the files do not depend on that.
     """
-    from groundwork.host.memory import gib
-
     spilled = memory.host_bytes(count)
     said = [
         f"{gib(spilled)} of {count:,} Gaussians are kept in the host's memory, as all of them need more than "

@@ -1,14 +1,14 @@
 """Losses and scores as events for TensorBoard, where the package is installed."""
 
-from typing import TYPE_CHECKING, Any
+import argparse
+from typing import Any
+
+import torch
 
 from splatting import events
+from splatting.iteration import Iteration, Losses
 from splatting.part import Part
-
-if TYPE_CHECKING:
-    import argparse
-
-    from splatting.iteration import Iteration, Losses
+from splatting.scores import training_report
 
 
 class Tensorboard(Part):
@@ -17,19 +17,17 @@ class Tensorboard(Part):
     name = "tensorboard"
 
     @classmethod
-    def wanted(cls, given: "argparse.Namespace") -> bool:
+    def wanted(cls, given: argparse.Namespace) -> bool:
         return True
 
     def opened(self, run: Any) -> None:
-        from splatting.scores import training_report
-
         self._run = run
         self._writes = run.writer is not None and run.report is training_report
         self._kept: list[tuple] = []
         if run.writer is not None:
             run.resources.callback(run.writer.close)
 
-    def measured(self, at: "Iteration", losses: "Losses") -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         if not self._writes:
             return
         if at.iteration % events.INTERVAL == 0 and not at.takes(self._run.launch.test_iterations):
@@ -40,8 +38,6 @@ class Tensorboard(Part):
 
     def _write(self) -> None:
         """Write what is kept. The GPU is waited for once, and not once for each loss."""
-        import torch
-
         kept, self._kept = self._kept, []
         values = torch.stack([loss.detach() for _, *pair, _ in kept for loss in pair]).cpu().view(-1, 2)
         for (iteration, *_, seconds), (l1, total) in zip(kept, values, strict=True):

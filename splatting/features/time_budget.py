@@ -1,20 +1,21 @@
 """Trainings that end with their seconds (--time_budget), or in as many iterations as another one (--schedule)."""
 
+import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from groundwork.files.json_files import SCHEDULE
-from splatting.option import MOST_NEEDED, Option, within
-from splatting.part import Options, Part, fill
-
-if TYPE_CHECKING:
-    import argparse
-
-    from scene.images.store import ImageStore
-    from scene.scene import Scene
-    from scene.view import View
-    from splatting.features.time_budget_schedule import DecidedSchedule
-    from splatting.iteration import Iteration
+from groundwork.host.memory import free_memory
+from scene.gaussians.density_rules import band_rate
+from scene.images.store import GPU_SHARE, ImageStore
+from scene.scene import Scene
+from scene.view import View
+from splatting.features.time_budget_file import schedule_of, table_of, write_schedule
+from splatting.features.time_budget_schedule import AN_ITERATION, SHORT, DecidedSchedule
+from splatting.iteration import Iteration
+from splatting.part import Part, fill
 
 LEAST = 32  # pixels of the shorter side of a view; a picture is not made smaller than that
 
@@ -26,57 +27,37 @@ class TimeBudget(Part):
     """
 
     name = "time_budget"
-    # fmt: off
-    options = Options(optimisation=(
-        Option("time_budget", 0.0, origin="ours", compared=False, topic=MOST_NEEDED,
-            above_zero=True, unset="none", check=within(0, 31_536_000),  # a year
-            help="seconds to train, without scores and saves, or more if a finished run is resumed. "
-                 "The schedule of --iterations is fitted into them, with 25 to 50 Gaussians for each "
-                 "iteration. --strategy auto then means budget, or mcmc for at most 50 photos on a GPU with 0.25 "
-                 "s or more for each"),
-        Option("schedule", "", origin="ours", compared=False, topic="quality and speed",
-            help="schedule.json of a run with --time_budget: repeat its schedule, independent of the clock. Or a "
-                 "number: fit the whole schedule of --iterations into this many iterations"),
-    ))
-    # fmt: on
     _iteration = 0  # of a run; a scene without one saves no schedule
     ends_by = {"time_budget": True, "schedule": False}
 
     @classmethod
-    def wanted(cls, given: "argparse.Namespace") -> bool:
+    def wanted(cls, given: argparse.Namespace) -> bool:
         return bool(getattr(given, "time_budget", 0) or getattr(given, "schedule", ""))
 
     @classmethod
-    def dropped(cls, given: "argparse.Namespace", iteration: int) -> str | None:
+    def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
         return (
             f"{given.start_checkpoint} was trained with --time_budget or --schedule; this run has neither and "
             f"continues at iteration {iteration} of --iterations {given.iterations}"
         )
 
     def check(self, run: Any, state: Any) -> None:
-        from splatting.features.time_budget_file import schedule_of
-
         self._run = run
         schedule = schedule_of(run.opt, run.start, run.first_iteration, run.group.broadcast_object, state)
         fill(run, "schedule", schedule, self)
-        self._end_in_time(run.opt)
+        self._end_in_time(run)
 
     @staticmethod
-    def _end_in_time(opt: "argparse.Namespace") -> None:
+    def _end_in_time(run: Any) -> None:
         """Let rows change no longer than by default, 1/2 or 5/6 of the schedule, where that is to go on to its end.
 
         A run by the clock has few iterations, and needs the last ones for what it has.
         """
-        from splatting.registry import part_class, strategies
-
-        for name, part in {part_class(strategy).until for strategy in strategies()}:
-            if getattr(opt, name) >= opt.iterations:
-                setattr(opt, name, int(part * opt.iterations))
+        for name, part in {strategy.until for strategy in run.strategies}:
+            if getattr(run.opt, name) >= run.opt.iterations:
+                setattr(run.opt, name, int(part * run.opt.iterations))
 
     def begin(self, run: Any, state: Any) -> None:
-        from scene.gaussians.density_rules import band_rate
-        from splatting.features.time_budget_schedule import AN_ITERATION, SHORT
-
         run.schedule.random = run.scene.info.has_random_points
         run.schedule.short = SHORT[run.device.type]
         cameras = run.scene.getTrainCameras()
@@ -89,18 +70,14 @@ class TimeBudget(Part):
         before, now = map(self._run.schedule.schedule_step, (iteration - 1, iteration))
         return self._run.sizes.factor_at(before) != self._run.sizes.factor_at(now)
 
-    def measured(self, at: "Iteration", losses: object) -> None:
+    def measured(self, at: Iteration, losses: object) -> None:
         self._iteration = at.iteration
 
     def state(self) -> dict[str, Any] | None:
-        from splatting.features.time_budget_file import table_of
-
         schedule = self._run.schedule
         return table_of(schedule.decided) if schedule.blocks else None
 
-    def save(self, scene: "Scene") -> None:
-        from splatting.features.time_budget_file import write_schedule
-
+    def save(self, scene: Scene) -> None:
         if self._iteration:
             write_schedule(Path(scene.model_path) / SCHEDULE, self._run.schedule.up_to(self._iteration))
 
@@ -114,7 +91,7 @@ class Sizes:
     size. factor: of the last view.
     """
 
-    def __init__(self, schedule: "DecidedSchedule", images: "ImageStore") -> None:
+    def __init__(self, schedule: DecidedSchedule, images: ImageStore) -> None:
         self.factor = 1.0
         self._schedule = schedule
         self._images = images
@@ -125,11 +102,11 @@ class Sizes:
         """The factor at an iteration of the schedule."""
         return self._schedule.factor_at(schedule_step)
 
-    def smallest(self, camera: "View") -> tuple[int, int]:
+    def smallest(self, camera: View) -> tuple[int, int]:
         """The smallest size (width, height) in which a view may train."""
         return smaller(camera, max((factor for _, factor in self._schedule.possible_levels), default=1.0))
 
-    def view(self, camera: "View", schedule_step: int) -> "View":
+    def view(self, camera: View, schedule_step: int) -> View:
         """A view as it is trained at an iteration of the schedule. Ask in ascending order."""
         factor = self.factor_at(schedule_step)
         if factor != self.factor:
@@ -143,23 +120,16 @@ class Sizes:
                 self._made[camera] = found
         return found
 
-    def needs(self, camera: "View") -> bool:
+    def needs(self, camera: View) -> bool:
         """Whether the pictures of a view will be needed in their own size."""
         return camera not in self._made
 
-    def _shrinks(self, camera: "View") -> bool:
-        from scene.view import View
-
+    def _shrinks(self, camera: View) -> bool:
         if self.factor == 1 or not isinstance(camera, View) or not camera.has_dataset_pictures:
             return False
         return smaller(camera, self.factor) != (camera.image_width, camera.image_height)
 
     def _begin(self, factor: float) -> None:
-        import torch
-
-        from groundwork.host.memory import free_memory
-        from scene.images.store import GPU_SHARE
-
         self.factor = factor
         self._made.clear()
         free = free_memory(torch.device(self._images.device))
@@ -168,13 +138,8 @@ class Sizes:
         self._keeps = not self._images.ranks.any_rank(self._images.limit > 0 or not room)
 
 
-def smaller(camera: "View", factor: float) -> tuple[int, int]:
+def smaller(camera: View, factor: float) -> tuple[int, int]:
     """Size (width, height) of a view whose sides are divided by a factor, or by less if it is small."""
     sides = camera.image_width, camera.image_height
     factor = max(1.0, min(factor, min(sides) / LEAST))
     return tuple(max(1, round(side / factor)) for side in sides)
-
-
-def for_few_iterations(count: int) -> str:
-    """Options by which so many iterations go through the whole schedule."""
-    return f"--schedule {count} in place of --iterations {count}"

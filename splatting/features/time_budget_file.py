@@ -13,7 +13,6 @@ from typing import Any
 
 from groundwork.files.json_files import SCHEDULE, read_json, write_json
 from splatting.features.time_budget_schedule import AUTO, Block, Continued, Decided, DecidedSchedule, TimeBudget
-from splatting.registry import strategies
 from utils.system_utils import UserError
 
 _SIZES = "resolution_schedule"  # key of the sizes of views
@@ -67,6 +66,8 @@ def _decided(content: Any) -> Decided:
     levels = [(_number(part, 0.0), _number(factor, 1.0)) for part, factor in content["levels"]]
     if levels != sorted(levels):
         raise ValueError("its levels do not ascend")
+    from arguments.features import strategies  # at run time alone, as `Scene` of other programs may load this module
+
     if (strategy := content.get("strategy", "")) not in ("", *strategies()):
         raise ValueError(f"{strategy!r} is no strategy")
     begun = content.get("begun", 0.0)

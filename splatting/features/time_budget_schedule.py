@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from splatting.registry import part_class, strategies
 from splatting.schedule import Schedule, longer_steps
 
 _PACE = 5  # blocks that tell the pace of a run
@@ -230,8 +229,8 @@ class TimeBudget(DecidedSchedule):
     def best_strategy(self, run: Any) -> str:
         """The one that is best in the seconds, of those that the run's parts work with."""
         against = {conflict for part in run.parts for conflict in part.against}  # such as a sky that was found
-        fit = [name for name in strategies() if f"strategy={name}" not in against]
-        best = (name for name in fit if part_class(name).best_in(self.seconds, run))
+        fit = [one for one in run.strategies if f"strategy={one.name}" not in against]
+        best = (one.name for one in fit if one.best_in(self.seconds, run))
         strategy = next(best, super().best_strategy(run))
         print(f"--time_budget chose --strategy {strategy}; give --strategy to use another one")
         return strategy

@@ -1,20 +1,16 @@
 """Readers of a model folder: number of Gaussians, curve, log, scores."""
 
-import argparse
 import re
 import sys
 from pathlib import Path
 from typing import Any
 
-from arguments.stored import read_model_json, read_stored_options
-from groundwork.files.json_files import SCHEDULE, read_json
+from groundwork.files.json_files import read_json, read_model_json
 from groundwork.files.plain_files import plain_path
-from scene.gaussians.sh_bands import SH_INTERVAL
 from splatting.records.error_curve import NAME as CURVE
 from splatting.records.error_curve import Row, read_curve
 from splatting.records.training_log import NAME as LOG
 from splatting.records.training_log import read_log
-from splatting.registry import PARTS, part_class
 from utils.system_utils import UserError, saved_iterations, saved_ply
 
 
@@ -49,20 +45,6 @@ def trained_gaussians(model: Path, iteration: int) -> int:
     except (UserError, KeyError, TypeError, ValueError):
         return saved  # a model of another program, which leaves nothing out
     return trained if iteration == trained_iterations(model)[-1] and trained - unseen == saved else saved
-
-
-def shorter_ends_there(model: Path, iterations: int) -> bool:
-    """Tell whether a training of so many --iterations ends with the model that a longer one has then.
-
-    False if that is not known, and for so few that SH bands are raised sooner.
-    """
-    if (model / SCHEDULE).is_file() or iterations < SH_INTERVAL:
-        return False
-    try:
-        options = read_stored_options(model)
-    except UserError:
-        return False
-    return not any(part_class(name).follows_length(argparse.Namespace(**options)) for name in PARTS)
 
 
 def load_scores(model: Path, method: str) -> tuple[dict[str, float | None], dict[str, dict[str, float | None]]]:

@@ -20,6 +20,7 @@ from utils.system_utils import UserError, atomic_write, saved_ply
 
 GIVEN_POSES = "given_poses"  # behind the name of renders and scores with the dataset's poses, where others were trained
 FITTED = "fitted_appearance"  # the same of right halves, with the photos' appearance fitted to left ones
+MASK_PICTURE = "robust_masks.png"  # in a model folder: photos of which a training has masked most
 BESIDE = (GIVEN_POSES, FITTED)
 SCORES = ("PSNR", "SSIM", "LPIPS", "DISTS", "STLPIPS")
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from splatting.features.budget_rules import error_scores, fade, split_in_two
 from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule
 from splatting.objective import Objective
 from splatting.part import Strategy
-from splatting.registry import part_class
+from splatting.registry import strategy_part
 from splatting.schedule import STEADY, Schedule
 from utils.graphics_utils import getProjectionMatrix
 from utils.system_utils import UserError
@@ -238,7 +238,7 @@ def test_the_loss_sees_what_is_brighter_than_white(strategy, clamped):
     """Unlike the reference's. Else Gaussians brighter than a white background float before it, and hide test views."""
     bright = torch.full((3, HEIGHT, WIDTH), 1.5, requires_grad=True)
     step = SimpleNamespace(camera=View(), background=GREY, terms={})
-    run = SimpleNamespace(opt=options(), strategy=part_class(strategy), pixel_filter=None, gaussians=model(1))
+    run = SimpleNamespace(opt=options(), strategy=strategy_part(strategy), pixel_filter=None, gaussians=model(1))
     Objective(run)({"render": bright}, step).total.backward()
     assert bool(bright.grad.any()) != clamped
 

@@ -20,12 +20,13 @@ from viewer_client import Viewer, as_bytes, packed, request
 from waiting import LIMIT, wait_for
 
 import train
+from arguments.features import FEATURES, Options
 from arguments.launch import launch_options
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
 from splatting.features.remote_viewer import RemoteViewer
-from splatting.part import Options, Part
+from splatting.part import Part
 
 ITERATIONS = 60
 OPTIONS = (), ("--train_test_exp", "--antialiasing", "-w", "--random_background", "--convert_SHs_python")
@@ -276,9 +277,10 @@ def test_an_address_that_cannot_be_had_is_one_warning(address, capfd):
 def test_a_second_training_says_nothing_of_a_port_that_nobody_chose(colmap_scene, tmp_path, monkeypatch, capfd):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        ip, given, switch = RemoteViewer.options.launch
+        ip, given, switch = FEATURES[RemoteViewer.name].launch
         for default, warnings in ((port, 0), (1, 1)):
-            monkeypatch.setattr(RemoteViewer, "options", Options(launch=(ip, replace(given, default=default), switch)))
+            options = Options(launch=(ip, replace(given, default=default), switch))
+            monkeypatch.setitem(FEATURES, RemoteViewer.name, options)
             train_on(colmap_scene, tmp_path / f"{warnings}", "--iterations", 1, "--port", port, "-r", 48)
             assert capfd.readouterr().err.count("cannot listen at") == warnings
 

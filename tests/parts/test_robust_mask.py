@@ -111,7 +111,7 @@ def test_a_training_shows_what_it_leaves_out(scene, tmp_path, monkeypatch):
     (said,) = [line for line in lines if line.startswith("--robust_mask leaves out")]
     files = [path for path in (tmp_path / "whole" / residuals.FOLDER).rglob("*.png")]
     assert f"in {len(files)} of 14 photos" in said and files
-    with Image.open(tmp_path / "whole" / residuals.PICTURE) as picture:
+    with Image.open(tmp_path / "whole" / residuals.MASK_PICTURE) as picture:
         pixels = np.asarray(picture, int)
     wide = (picture.width - 3 * GAP) // 2
     left, right = pixels[HEADER:, GAP : GAP + wide], pixels[HEADER:, -GAP - wide : -GAP]

@@ -114,5 +114,5 @@ def test_depth_comes_nearer_to_points_of_test_views(scene, tmp_path, monkeypatch
 
 
 def test_off_reads_no_tracks(scene, tmp_path, monkeypatch):
-    monkeypatch.setattr("scene.readers.tracks.read_tracks", lambda *_: pytest.fail("tracks are read"))
+    monkeypatch.setattr("splatting.features.sparse_depth.read_tracks", lambda *_: pytest.fail("tracks are read"))
     trained(scene, tmp_path / "off", "--test_iterations", -1)

@@ -33,9 +33,8 @@ from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting import resources, run
 from splatting.features import spill as spill_part
 from splatting.features import spill_memory as gpu_memory
-from splatting.features.spill import sentences
+from splatting.features.spill import Spill, sentences
 from splatting.features.spill_memory import GpuMemory, resident_rows, spillable_bytes
-from splatting.registry import part_class
 from splatting.resources import training_bytes
 from utils.system_utils import UserError
 
@@ -140,7 +139,7 @@ def test_a_training_leaves_torch_what_it_had(monkeypatch):
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", share.append)
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
     monkeypatch.setattr(gpu_memory, "_before", [])
-    part = part_class("spill")()
+    part = Spill()
     part.ended(None)
     assert share == [0.4]
     for limit in (100, 200):
@@ -149,7 +148,7 @@ def test_a_training_leaves_torch_what_it_had(monkeypatch):
     assert share == [0.4, 0.1, 0.2, 0.4]
     gpu_memory.limit_torch(300, torch.device("cuda"))
     opt = SimpleNamespace(gpu_memory=0.0, absgrad=False)
-    part.check(SimpleNamespace(gaussians=model(50), opt=opt, device=torch.device("cpu")), None)
+    part.check(SimpleNamespace(gaussians=model(50), opt=opt, device=torch.device("cpu"), strategies=[]), None)
     assert share == [0.4, 0.1, 0.2, 0.4, 0.3, 0.4]
 
 

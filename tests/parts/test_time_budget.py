@@ -21,7 +21,7 @@ from splatting.features.time_budget_schedule import Block, Decided, DecidedSched
 from splatting.iteration import Iteration
 from splatting.log import ProgressBar
 from splatting.records.training_log import Stopwatch
-from splatting.registry import strategy_part
+from splatting.registry import strategies, strategy_part
 from splatting.run import Run
 from splatting.schedule import Schedule, longer_steps
 from utils.system_utils import UserError
@@ -357,10 +357,10 @@ def test_a_short_training_by_the_clock_begins_with_smaller_views_and_replays(
         return _train(colmap_scene, tmp_path / name, "-r", 1, "--iterations", 1200, *more)
 
     _timed(monkeypatch, lambda t: 0.04)
-    monkeypatch.setattr(f"{TimeBudget.__module__}.SHORT", {"cpu": 0.01, "cuda": 0.01})  # for photos this small
+    monkeypatch.setattr("splatting.features.time_budget.SHORT", {"cpu": 0.01, "cuda": 0.01})  # for photos this small
     short = trained("short", "--time_budget", 4, "--checkpoint_iterations", 600)
     with monkeypatch.context() as patch:
-        patch.setattr(f"{TimeBudget.__module__}.SHORT", {"cpu": math.inf, "cuda": math.inf})
+        patch.setattr("splatting.features.time_budget.SHORT", {"cpu": math.inf, "cuda": math.inf})
         whole = trained("whole", "--time_budget", 4)
     assert short.keys() == whole.keys() and short != whole  # by a clock that sizes do not move
     monkeypatch.undo()
@@ -533,7 +533,7 @@ def test_a_time_budget_takes_the_strategy_that_is_best_in_it(colmap_scene, tmp_p
 )
 def test_few_photos_and_much_time_on_a_gpu_take_mcmc(views, seconds, device, strategy):
     scene = SimpleNamespace(getTrainCameras=lambda: [None] * views)
-    run = SimpleNamespace(scene=scene, device=torch.device(device), parts=[])
+    run = SimpleNamespace(scene=scene, device=torch.device(device), parts=[], strategies=strategies())
     schedule = TimeBudget(Decided(30_000, [], None, seconds))
     assert schedule.best_strategy(run) == strategy
 

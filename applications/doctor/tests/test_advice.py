@@ -25,7 +25,7 @@ from scene.readers.tracks import Track
 from splatting.checks import check_overfitting
 from splatting.records.error_curve import COLUMNS, NAME, Row, write_curve
 from splatting.records.training_log import NAME as LOG
-from splatting.registry import tools
+from splatting.registry import PARTS
 from utils.system_utils import UserError
 
 SIDE = 20
@@ -48,7 +48,7 @@ def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengt
 def test_what_may_be_advised_is_measured():
     """In the table of what scenes gain that ask for it, or beside: nothing is recommended on other grounds."""
     measured = (advice.ROOT / "docs/results/options.md").read_text().partition("## One fault")[0]
-    code = [inspect.getsource(tool) for name in ("advise", "advise_trained") for tool in tools(name)]
+    code = [inspect.getsource(advises) for part in PARTS for advises in (part.advise, part.advise_trained)]
     named = {*re.findall(r'"(--\w+)', "".join([*code, inspect.getsource(advice._check_distances)]))}
     assert named == {"--antialiasing", "--appearance", "--refine_poses", "--robust_mask", "--sky"}
     assert all(f"`{name}" in measured for name in named)

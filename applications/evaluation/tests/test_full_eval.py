@@ -26,10 +26,11 @@ import full_eval
 from applications.evaluation import report as report_module
 from applications.evaluation.child import Finished, Slot, run_child
 from applications.evaluation.plan import DATASETS, dataset_scenes, describe_photos
+from applications.evaluation.results import shorter_ends_there
 from arguments import write_cfg_args
+from groundwork.files.json_files import SCHEDULE
 from groundwork.host.interrupt import DeferredInterrupt
 from splatting.records.figures import draw_curves
-from splatting.records.model_folder import SCHEDULE, shorter_ends_there
 from splatting.records.renders import GAIN, ComparedViews
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError

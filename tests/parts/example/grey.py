@@ -1,32 +1,22 @@
 """A worked example of a part: a loss term with an option, a state, and numbers in the log (tests/test_example.py)."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from splatting.option import Option, at_least
-from splatting.part import Error, Options, Part
-
-if TYPE_CHECKING:
-    from splatting.iteration import Iteration, Losses, Term
+from splatting.iteration import Iteration, Losses, Term
+from splatting.objective import LossWatch
+from splatting.part import Error, Part
 
 
 class Grey(Part):
     """Draws renders towards grey: adds the weighted mean spread of a pixel's three channels to the loss."""
 
-    name = "grey"  # of the folder, of the state in a checkpoint, and of the option that brings the part in
-    # fmt: off
-    options = Options(optimisation=(
-        Option("grey", 0.0, origin="ours", check=at_least(0),
-            help="weight of the spread of colours in renders, which draws them towards grey; 0: off"),
-    ))
-    # fmt: on
+    name = "grey"  # of the file, of the state in a checkpoint, and of the option that brings the part in
 
     def begin(self, run: Any, state: Any) -> None:
-        from splatting.objective import LossWatch
-
         self._run = run
         self._mean = LossWatch(0.0 if state is None else state["mean"])  # a running mean, of the whole training
 
-    def terms(self, at: "Iteration") -> "dict[str, Term]":
+    def terms(self, at: Iteration) -> dict[str, Term]:
         weight, columns = self._run.opt.grey, at.camera.columns or slice(None)
 
         def term(package: dict[str, Any], mask: Any) -> Any:
@@ -35,7 +25,7 @@ class Grey(Part):
 
         return {"grey": term}
 
-    def measured(self, at: "Iteration", losses: "Losses") -> None:
+    def measured(self, at: Iteration, losses: Losses) -> None:
         self._mean.add(at.iteration, losses.terms["grey"])  # noted, not read: the GPU may be some steps behind
 
     def records(self) -> dict[str, float]:

@@ -2,32 +2,23 @@
 
 from typing import Any
 
+import torch
+
+from scene.gaussians.density_rules import mean_gradient
 from splatting.features.adc import Adc
-from splatting.option import Option, at_least
-from splatting.part import Options
 
 
 class Patient(Adc):
     """Adaptive density control of Gaussians whose mean gradient was large in several densifications in a row."""
 
     name = "patient"
-    summary = "as adc, but Gaussians grow only after --patience densifications in a row with a large gradient"
     fusable = True  # it needs no gradient besides the statistics; not inherited
-    # fmt: off
-    options = Options(optimisation=(
-        Option("patience", 2, origin="ours", check=at_least(1),
-            help="patient: densifications in a row in which a Gaussian's gradient reaches densify_grad_threshold "
-                 "before it is cloned or split; 1: as adc"),
-    ))
-    # fmt: on
 
     @classmethod
     def takes_absolute(cls, opt: Any) -> bool:
         return False  # --absgrad is of adc alone
 
     def begin(self, run: Any, state: Any) -> None:
-        import torch
-
         super().begin(run, state)
         self._patience = run.opt.patience
         self._model = model = run.gaussians
@@ -36,10 +27,6 @@ class Patient(Adc):
         model.columns[self.name] = started.to(model.get_xyz.device)
 
     def densify(self, iteration: int, limit_size: bool) -> None:
-        import torch
-
-        from scene.gaussians.density_rules import mean_gradient
-
         model = self._model
         large = mean_gradient(model.xyz_gradient_accum, model.denom) >= self.threshold
         streaks = model.columns[self.name] = torch.where(large, model.columns[self.name] + 1, 0)
