@@ -79,7 +79,7 @@ def test_differences_name_what_and_whose():
 class _Asked(_Second):
     """Of two ranks the one that was asked for something else."""
 
-    def everyone(self, value: dict[str, str]) -> list[dict[str, str]]:
+    def all_gather_objects(self, value: dict[str, str]) -> list[dict[str, str]]:
         return [{name: "1" if name == "--seed" else found for name, found in value.items()}, value]
 
 
@@ -94,7 +94,7 @@ def test_ranks_of_which_one_lacks_the_masks_are_refused(tmp_path):
     source, facts = narrow_scene(tmp_path / "scene"), []
 
     class Pair(_Second):
-        def everyone(self, value: dict) -> list[dict]:
+        def all_gather_objects(self, value: dict) -> list[dict]:
             facts.append(value)
             return facts[-2:]
 
