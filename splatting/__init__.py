@@ -1,1 +1,1 @@
-"""All that the layout of the reference has no room for, in one package."""
+"""The trainer: everything for which the layout of the reference has no place."""

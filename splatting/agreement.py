@@ -1,4 +1,4 @@
-"""Agreement of the processes of a training: before it begins, and in each iteration."""
+"""Agreement of the processes that train together: on options and data at the start, on signals in each iteration."""
 
 import argparse
 import hashlib
@@ -20,7 +20,7 @@ _EXTENSIONS = ("diff_gaussian_rasterization", "simple_knn", "fused_ssim")
 
 
 def agree_on_options(args: argparse.Namespace) -> None:
-    """UserError if ranks have other code or options than rank 0."""
+    """Raise UserError if a rank has other code or options than rank 0."""
     if not ranks().several:
         return
     refuse_differences(ranks().all_gather_objects(_code()), "give all ranks the same files", shown=False)
@@ -29,7 +29,10 @@ def agree_on_options(args: argparse.Namespace) -> None:
 
 
 def agree_on_scene(scene: Scene, start: str | None) -> None:
-    """UserError if ranks have read another scene or checkpoint (start: the one resumed) than rank 0."""
+    """Raise UserError if a rank has read another scene or checkpoint than rank 0.
+
+    start: path of the checkpoint that is resumed, or None.
+    """
     if not ranks().several:
         return
     facts = {"the training views": _digest(scene.getTrainCameras()), "the test views": _digest(scene.getTestCameras())}
@@ -39,7 +42,7 @@ def agree_on_scene(scene: Scene, start: str | None) -> None:
 
 
 def _code() -> dict[str, str]:
-    """Digests of the Python files that take part, by path, and of the extensions' binaries, by name."""
+    """Return digests of the Python files that take part, by path, and of the extensions' binaries, by name."""
     paths = [_ROOT / "train.py", *(path for room in _ROOMS for path in (_ROOT / room).rglob("*.py"))]
     found = {str(path.relative_to(_ROOT)): path for path in sorted(paths)}
     for name in _EXTENSIONS:
@@ -50,7 +53,7 @@ def _code() -> dict[str, str]:
 
 
 def _digest(cameras: Sequence[Camera]) -> str:
-    """Digest of names, sizes, matrices, and kinds of image files (photo, mask, depth map)."""
+    """Return a digest of cameras: names, sizes, lenses, matrices, and kinds of image files (photo, mask, depth map)."""
     digest = hashlib.sha256()
     for camera in cameras:
         kinds = [getattr(source, "suffix", type(source).__name__) for source, _ in getattr(camera, "undecoded", ())]
@@ -66,12 +69,17 @@ _SIGNALS = (None, KeyboardInterrupt, Terminated)
 class StepAgreement(Part):
     """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
 
-    These go with the numbers that they exchange to render the iteration's view (`all_gather_ints`), and are known when
-    its losses are. A signal counts for the iteration that begins after it, on all, whichever has got it.
+    These facts travel with the numbers that ranks exchange to render the iteration's view (`all_gather_ints`), and are
+    known when the losses are. A signal counts on all ranks for the iteration that begins after it, whichever rank has
+    received it.
     """
 
     def __init__(self, group: Ranks, interrupt: DeferredInterrupt, guard: StepGuard | None) -> None:
-        """interrupt: of this process. guard: that of its optimisers, if they have one."""
+        """Prepare the exchange.
+
+        interrupt: signals of this process.
+        guard: guard of its optimisers, or None.
+        """
         self._group, self._interrupt = group, interrupt
         if group.several:
             group.flag = None if guard is None else guard.stopped
@@ -87,9 +95,9 @@ class StepAgreement(Part):
 
     @property
     def stopping(self) -> type[KeyboardInterrupt] | None:
-        """What asks to stop after this iteration."""
+        """The signal that asks to stop after this iteration, or None."""
         return self._asked if self._group.several else self._interrupt.requested
 
     def wait(self) -> None:
-        """Wait until the first has written what it writes: torchrun ends all once one has ended."""
+        """Wait until the first rank has written its files: torchrun ends all processes once one of them has ended."""
         self._group.any_rank(False)

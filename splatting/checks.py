@@ -1,4 +1,4 @@
-"""A training: before it, what cannot be trained or reached; after it, whether it overfitted."""
+"""Checks around a training: before it, what cannot be trained or reached; after it, whether it overfitted."""
 
 import argparse
 import sys
@@ -24,7 +24,7 @@ STEP_ALONE, STEP_SHARED = (0.9, 1.25), (2.8, 0.87)
 
 
 def check_alone(projection: str, several: bool) -> None:
-    """Refuse rays of a training of several processes (UserError)."""
+    """Refuse --projection ray in a training of several processes (UserError)."""
     if several and projection == "ray":
         raise UserError(
             "--projection ray needs a training of one process; leave it out, or start train.py without torchrun"
@@ -32,7 +32,7 @@ def check_alone(projection: str, several: bool) -> None:
 
 
 def check_native(options: argparse.Namespace) -> None:
-    """Say where --lenses native, as it was given, comes too late."""
+    """Warn where --lenses native was given for photos that are undistorted already."""
     if getattr(options, "lenses", "") == "native" and has_undistorted_photos(options.source_path):
         print(
             "warning: --lenses native has no effect, since convert.py undistorted the photos of this scene; to train "
@@ -42,7 +42,10 @@ def check_native(options: argparse.Namespace) -> None:
 
 
 def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[Finding]:
-    """Warnings before a run (splatting/run.py). given: the optimisation options as they were given."""
+    """Yield the warnings before a run (splatting/run.py).
+
+    given: the optimisation options as the user gave them.
+    """
     density, opt, count, done = run.strategy, run.opt, run.gaussians.gaussian_count, run.first_iteration
     expected = expected_count(density.max_gaussians, count)
     sure = min(count, density.max_gaussians or count)
@@ -57,7 +60,10 @@ def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[Finding]:
 
 
 def faster_alone(ranks: int, on_gpu: bool, count: int) -> Finding | None:
-    """What to say if one GPU would train `count` Gaussians, as many as there may be, faster than several do."""
+    """Return a warning if one GPU would train `count` Gaussians faster than several GPUs do; otherwise None.
+
+    count: the most Gaussians that there may be.
+    """
     alone, shared = (base + each * count / 1e6 for base, each in (STEP_ALONE, STEP_SHARED))
     if ranks == 1 or not on_gpu or shared < alone:
         return None
@@ -67,16 +73,18 @@ def faster_alone(ranks: int, on_gpu: bool, count: int) -> Finding | None:
 
 
 def without_effect(opt: argparse.Namespace, strategy: str) -> Finding | None:
-    """What to say of given options that belong to another strategy."""
+    """Return a warning about given options that belong to another strategy, or None."""
     others = [option for one in strategies() if one.name != strategy for option in FEATURES[one.name].optimisation]
     given = [f"--{option.name}" for option in others if getattr(opt, option.name) != option.default]
     return Finding(f"--strategy {strategy} ignores {some(given)}") if given else None
 
 
 def late_reset(density: Strategy, opt: argparse.Namespace, done: int) -> Finding | None:
-    """What to say if a strategy resets opacities so late that the model cannot recover.
+    """Return a warning if a strategy resets opacities so late that the model cannot recover, or None.
 
-    done: iterations before this run, which may have been the reset. A run with a time budget leaves such resets out.
+    A run with a time budget leaves such resets out.
+
+    done: iterations before this run, the last of which may have been the reset.
     """
     schedule = density.schedule
     if schedule.paced:
@@ -93,9 +101,12 @@ def late_reset(density: Strategy, opt: argparse.Namespace, done: int) -> Finding
 
 
 def another_number(density: Strategy, opt: argparse.Namespace, count: int, first: int) -> Finding | None:
-    """What to say if a strategy cannot reach its number of Gaussians in time.
+    """Return a warning if a strategy cannot reach its number of Gaussians in time, or None.
 
-    count: of Gaussians, now; first: the next iteration. Not known of a run with a time budget.
+    The number that a run with a time budget will reach is not known, so there is no warning either.
+
+    count: present number of Gaussians.
+    first: the next iteration.
     """
     schedule, aim = density.schedule, density.max_gaussians
     if schedule.paced or schedule.schedule_step(first) >= density.ends > 0:
@@ -137,9 +148,10 @@ def _start_of(count: int, opt: argparse.Namespace) -> str:
 
 
 def check_overfitting(rows: Sequence[Row], records: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:
-    """Find test views that lost while training views gained.
+    """Find test views whose PSNR fell while that of the training views rose.
 
-    rows: of error_vs_time.csv; only those that score whole sets tell of scores. records: of train_log.json.
+    rows: rows of error_vs_time.csv, of which only those that score whole sets count.
+    records: records of train_log.json.
     """
     if (gained := gain_since_peak(rows)) is None:
         return

@@ -1,9 +1,10 @@
-"""Leaving out what the training views do not need: what their photos speak against, then what adds least to them.
+"""Cleaning: leave out Gaussians that the photos speak against, then those that add least to the training views.
 
-Leaving a Gaussian out changes a view's squared error by about the opacity times minus its derivative (Molchanov et al.
-2017, "Pruning convolutional neural networks for resource efficient inference"). Where the sum over the views is
-negative, the photos speak against the Gaussian, as they do for floaters. The others add to a view what they have of its
-blending weights. Both count by the view's error, as a view with a small one is the first to lose dB.
+Leaving a Gaussian out changes a view's squared error by about minus the opacity times the derivative of the error by
+the opacity (Molchanov et al. 2017, "Pruning convolutional neural networks for resource efficient inference"). Where the
+sum over the views is negative, the photos speak against the Gaussian, as they do for floaters. All other Gaussians are
+ordered by their share of a view's blending weights. Both are divided by the view's error, because a view with a small
+error is the first to lose dB.
 """
 
 import argparse
@@ -39,9 +40,10 @@ _SHOWN = 3  # views of the picture
 
 
 class Cleaning:
-    """A model of which more and more is left out, as long as no view loses more than `most` dB of its best PSNR.
+    """A model from which Gaussians are left out, as long as no view loses more than `most` dB of its best PSNR.
 
-    keep: (N,) bool. before, after: PSNR by view, dB.
+    keep: Gaussians that stay, (N,) bool.
+    before, after: PSNR by view, dB.
     """
 
     def __init__(self, gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, most: float) -> None:
@@ -58,7 +60,10 @@ class Cleaning:
         return self._views.scores([camera], gaussians).get("psnr", float("inf"))
 
     def _scores(self, keep: Tensor) -> dict[int, float] | None:
-        """PSNR by view without some Gaussians; None if one loses too much, which is asked first from then on."""
+        """Return the PSNR by view of a part of the model; None if a view loses too much.
+
+        That view is scored first from then on.
+        """
         gaussians, found = self._part(keep), {}
         for camera in self._cameras:
             found[id(camera)] = self._psnr(camera, gaussians)
@@ -69,7 +74,10 @@ class Cleaning:
         return found
 
     def leave_out(self, order: Tensor) -> None:
-        """Leave out as many Gaussians as may go, from the start of `order`, (n,) indices: by bisection."""
+        """Leave out as many Gaussians as possible from the start of a list, by bisection.
+
+        order: (n,) indices.
+        """
         low, high, scores = 0, len(order) + 1, None
         with Bar(desc="Trying what may go", unit="try", leave=False) as bar:
             while high - low > max(1, len(self._gaussians) // _STEPS):
@@ -85,7 +93,7 @@ class Cleaning:
             self._best = {view: max(score, scores[view]) for view, score in self._best.items()}
 
     def changes(self) -> Tensor:
-        """(N,) float64: the change of the views' errors without a Gaussian, as a sum of shares of these errors."""
+        """Return by how much the views' errors change without each Gaussian, relative to these errors: (N,) float64."""
         gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
         for camera in Bar(self._cameras, desc="Asking the photos", unit="view", leave=False):
             with torch.enable_grad():
@@ -97,9 +105,10 @@ class Cleaning:
         return found.nan_to_num(0.0)
 
     def added(self) -> Tensor:
-        """(N,) float64: the most that a Gaussian has of a view's weights, by the mean over pixels and by its error.
+        """Return the largest share that each Gaussian has in a view: (N,) float64.
 
-        Of the training views, and of views between neighbours, where others than these photos may show it.
+        The share is the sum of the Gaussian's blending weights, divided by the view's pixels and by its error. The
+        views are the training views, and views between neighbours, which may show Gaussians that the photos do not.
         """
         gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
         errors = [max(10 ** (-self.after[id(camera)] / 10), _EXACT) for camera in self._cameras]
@@ -117,7 +126,7 @@ class Cleaning:
 
 
 def _coarse(view: MiniCam) -> MiniCam:
-    """The view with half the pixels each way: a quarter of the work, with about the same shares of the image."""
+    """Halve a view's width and height: a quarter of the work, with about the same shares of the image."""
     view.image_width, view.image_height = (max(1, size // 2) for size in (view.image_width, view.image_height))
     return view
 
@@ -126,7 +135,8 @@ def _coarse(view: MiniCam) -> MiniCam:
 def clean(gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, most: float) -> Cleaning:
     """Leave Gaussians out of a model, so that no view's PSNR falls by more than `most` dB.
 
-    The model does not change. A view that gets better may not lose more than that of its gain either.
+    The model itself does not change. A view that has gained PSNR on the way may not lose more than `most` of its best
+    one.
     """
     cleaning = Cleaning(gaussians, cameras, views, most)
     changes = cleaning.changes()
@@ -138,7 +148,7 @@ def clean(gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredView
 
 
 def check_clean(most: float | None) -> None:
-    """UserError for a number that --clean does not take."""
+    """Raise UserError for a number that --clean does not take."""
     if most is not None and not 0 < most < math.inf:
         raise UserError(f"--clean must be above 0 dB, got {most}")
 
@@ -146,7 +156,10 @@ def check_clean(most: float | None) -> None:
 def clean_scene(
     scene: Scene | WithoutScene, most: float, pipe: argparse.Namespace, white: bool
 ) -> tuple[Cleaning, ScoredViews]:
-    """Clean a scene's model, and print what goes and what its training views lose. UserError if it has none."""
+    """Clean a scene's model, and print how many Gaussians go and what the training views lose.
+
+    UserError if the scene has no training views.
+    """
     cameras, background = scene.getTrainCameras(), torch.full((3,), float(white))
     if not cameras:
         raise UserError("--clean needs training views, and the scene has none; leave it out")
@@ -167,7 +180,7 @@ def clean_scene(
 def write_comparison(
     path: str | os.PathLike, gaussians: GaussianModel, keep: Tensor, cameras: Sequence[Camera], views: ScoredViews
 ) -> None:
-    """Write a PNG of the views that change most, a row for each view: before, gone, after."""
+    """Write a PNG of the views that change most, with a row for each view: before, gone, after."""
     degree = gaussians.max_sh_degree
     gone, after = gaussians.part(~keep, degree), gaussians.part(keep, degree)
     changes = [float((views.image(c, gaussians) - views.image(c, after)).square().mean()) for c in cameras]

@@ -1,4 +1,4 @@
-"""What a training writes for TensorBoard. The tags are the reference's."""
+"""Events of a training for TensorBoard, with the tags of the reference."""
 
 import sys
 from collections.abc import Callable, Mapping
@@ -16,30 +16,33 @@ _FLUSHED = 10  # seconds until events are in the file at the latest
 
 
 class Events:
-    """Writes events of one iteration by a SummaryWriter."""
+    """Writer of one iteration's events, by a SummaryWriter."""
 
     def __init__(self, writer: Any, iteration: int) -> None:
         self._writer = writer
         self._iteration = iteration
 
     def losses(self, l1: Tensor, total: Tensor, seconds: float) -> None:
-        """Of every tenth iteration, and the seconds that it took."""
+        """Write the losses of every tenth iteration, and the seconds that the iteration took."""
         if self._iteration % INTERVAL == 0:
             self._scalar("train_loss_patches/l1_loss", l1.item())
             self._scalar("train_loss_patches/total_loss", total.item())
             self._scalar("iter_time", seconds * 1000.0)
 
     def image(self, views: str, camera: Camera, what: str, image: Tensor) -> None:
-        """An image (3, H, W) of a view. views: the name of its set."""
+        """Write an image (3, H, W) of a view.
+
+        views: name of the view's set.
+        """
         self._writer.add_image(f"{views}_view_{camera.image_name}/{what}", image, global_step=self._iteration)
 
     def scores(self, views: str, means: Mapping[str, float]) -> None:
-        """Mean scores of a set of views: l1 and psnr."""
+        """Write the mean scores of a set of views: l1 and psnr."""
         for kind, value in means.items():
             self._scalar(f"{views}/loss_viewpoint - {kind.replace('l1', 'l1_loss')}", value)
 
     def model(self, gaussians: GaussianModel) -> None:
-        """Its opacities, and how many Gaussians it has."""
+        """Write a model's opacities, and its number of Gaussians."""
         self._writer.add_histogram("scene/opacity_histogram", gaussians.get_opacity, self._iteration)
         self._scalar("total_points", len(gaussians))
 
@@ -48,9 +51,10 @@ class Events:
 
 
 class EventWriter:
-    """A SummaryWriter of torch, all of whose methods can be called. ImportError without TensorBoard.
+    """A SummaryWriter of torch that never ends a training. ImportError without TensorBoard.
 
-    If one fails, as on a full disk, one warning says so, and nothing more is written.
+    All methods of SummaryWriter can be called. If one fails, as on a full disk, a warning says so, and nothing more is
+    written.
     """
 
     def __init__(self, log_dir: str) -> None:
@@ -95,7 +99,7 @@ class EventWriter:
 
 
 def summary_writer(folder: str) -> Any | None:
-    """A SummaryWriter of torch; None without TensorBoard."""
+    """Return a SummaryWriter of torch; None without TensorBoard."""
     try:
         return EventWriter(folder)
     except ImportError:

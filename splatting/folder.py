@@ -1,4 +1,4 @@
-"""The folder of a training: its name, keeping it, its checkpoints, and what earlier runs in it allow."""
+"""The folder of a training: its name, its lock, its checkpoints, and what earlier runs in the folder allow."""
 
 import argparse
 import contextlib
@@ -33,7 +33,7 @@ _INPUTS = ("cfg_args", "model.json", "cameras.json", "input.ply")
 
 
 def new_folder(scene: str = "") -> str:
-    """Name of a folder under ./output: OAR_JOB_ID as in the reference, else a new one after the folder of the scene."""
+    """Return a new folder under ./output: named by OAR_JOB_ID as in the reference, else after the scene's folder."""
     if job := os.environ.get("OAR_JOB_ID"):
         return os.path.join("./output/", ranks().broadcast_object(job)[:10])
     name = os.path.join("./output/", os.path.basename(os.path.realpath(scene)) or "model")
@@ -42,13 +42,16 @@ def new_folder(scene: str = "") -> str:
 
 
 def folder_of(checkpoint: str | None) -> str | None:
-    """The model folder that a checkpoint lies in, where a resumed training goes on unless another one is named."""
+    """Return the model folder of a checkpoint. A resumed training continues there unless it names another folder."""
     folder = Path(checkpoint or "").parent
     return str(folder) if checkpoint and (folder / "cfg_args").is_file() else None
 
 
 def view_command(model_path: str, iteration: int | None = None) -> str:
-    """The command that shows a model; iteration: None, the newest one."""
+    """Return the command that shows a model.
+
+    iteration: None, the newest one.
+    """
     older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration
     which = f" --iteration {iteration}" if older else ""
     return f"{typed_command('view.py')} -m {shlex.quote(model_path)}{which}"
@@ -56,9 +59,10 @@ def view_command(model_path: str, iteration: int | None = None) -> str:
 
 @contextlib.contextmanager
 def records_kept(model_path: str) -> Iterator[None]:
-    """Put the records of a saved model back, if an error ends a training of its folder before that has saved another.
+    """Put the records of a saved model back if an error ends a training in its folder before a new model is saved.
 
-    A photo that cannot be read, for one, is found when it is needed. Of several ranks, the first does so for all.
+    Such an error may come late: a photo that cannot be read, for one, is found when it is needed. The first of several
+    ranks does this for all.
     """
     folder = Path(model_path)
     saves = _stamps(folder) if ranks().first else {}
@@ -79,10 +83,10 @@ def _stamps(folder: Path) -> dict[Path, int]:
 
 @contextlib.contextmanager
 def own_folder(model_path: str) -> Iterator[None]:
-    """Make the folder and keep it for this training. UserError if another train.py is at work in it.
+    """Make the folder and lock it for this training. UserError if another train.py is at work in it.
 
-    Temporary files of killed runs are removed first. A message says if files of the run are missing at the end, as
-    when the folder was removed meanwhile. Of several ranks, the first does so for all.
+    Temporary files of killed runs are removed first. A warning at the end says if files of the run are missing, as when
+    somebody has removed the folder. The first of several ranks does this for all.
     """
     if not ranks().first:
         yield
@@ -106,9 +110,11 @@ _CHECKPOINT = re.compile(r"chkpnt(\d+)\.pth|" + re.escape(REPLACED))
 
 
 def resumed(start: str | None, folder: str, iterations: int) -> str | None:
-    """The checkpoint to begin with: `start`, or after a restart (--max-restarts) the newest one of this training.
+    """Return the checkpoint to begin with: `start`, or after a restart (--max-restarts) this training's newest one.
 
-    folder: of the output. A checkpoint that leaves nothing to do is none.
+    A checkpoint that leaves nothing to do does not count.
+
+    folder: output folder.
     """
     newest = newest_checkpoint(folder, iterations) if torchrun.restarts() else None
     if newest:
@@ -117,10 +123,10 @@ def resumed(start: str | None, folder: str, iterations: int) -> str | None:
 
 
 def newest_checkpoint(folder: str, below: float = float("inf"), since: float | None = None) -> str | None:
-    """The newest whole checkpoint of an iteration under `below`; of equally new ones, that of the highest.
+    """Return the newest whole checkpoint of an iteration under `below`; of equally new ones, that of the highest.
 
-    since: when it was written, in seconds since 1970. None: since torchrun began, so that it is of its processes, over
-    all restarts, and of no earlier training in the folder.
+    since: earliest time of writing, in seconds since 1970. None: the time at which torchrun began, so that the
+        checkpoint is of torchrun's processes, over all restarts, and not of an earlier training in the folder.
     """
     began = time.time() - (seconds_since_start(os.getppid()) or float("inf")) if since is None else since
     found = {}
@@ -140,10 +146,12 @@ def check_folder(
     first_iteration: int,
     checkpoint_iterations: Sequence[int] = (),
 ) -> None:
-    """Refuse a folder with a model of another scene (UserError), or with one that this training's options do not fit.
+    """Refuse a folder with a model of another scene, or with saves that this training's options do not fit (UserError).
 
-    now: all options. Warn of iterations that an earlier training has saved and this one does not overwrite. Programs
-    that read them take the folder's options, which are those of the last training.
+    Warn of iterations that an earlier training has saved and this one does not overwrite. Programs that read these
+    saves take the options of the folder, which are those of the last training.
+
+    now: all options.
     """
     folder = Path(now.model_path)
     saved, then = saves_in(folder), _options_of(folder)
@@ -173,15 +181,18 @@ def check_folder(
 
 
 def lies_in(checkpoint: str | None, folder: str | os.PathLike) -> bool:
-    """Whether a checkpoint, if there is one, lies in a model folder."""
+    """Tell whether there is a checkpoint that lies in a model folder."""
     return checkpoint is not None and _same_place(Path(checkpoint).parent, folder)
 
 
 def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False) -> None:
     """Warn if the run that wrote a checkpoint had other options than this run, `now`.
 
-    now: all options. Those that the checkpoint's folder does not record are not compared. UserError for another scene,
-    unless it is the same that has grown, for --eval after a training on all photos, and for an option that is gone.
+    Options that the checkpoint's folder does not record are not compared. UserError for another scene, for --eval after
+    a training on all photos, and for an option that no longer exists.
+
+    now: all options.
+    grown: true if the scene is the same, with more photos.
     """
     folder = Path(checkpoint).parent
     then = _options_of(folder)
@@ -219,10 +230,10 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
 
 
 def continue_records(model_path: str, checkpoint: str | None, first_iteration: int) -> tuple[TrainingLog, list[Row]]:
-    """The log of a training and the rows of its curve up to `first_iteration`; none for a training from the start.
+    """Return the log of a training and the rows of its curve up to `first_iteration`; both empty for a new training.
 
-    Both are read from the checkpoint's folder if that has a log, else from model_path. This run continues them
-    in model_path.
+    Both are read from the checkpoint's folder if that has a log, else from model_path. This run continues them in
+    model_path.
     """
     before = Path(model_path)
     if checkpoint and (Path(checkpoint).parent / training_log.NAME).is_file():
@@ -240,15 +251,15 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
 
 
 def strategy_of(checkpoint: str) -> str:
-    """The strategy of the run that wrote a checkpoint; adc if its folder does not say."""
+    """Return the strategy of the run that wrote a checkpoint; adc if its folder does not say."""
     return str(_options_of(Path(checkpoint).parent).get("strategy", "adc"))
 
 
 def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
-    """Model options whose --lenses auto is decided: native, or that of the run that wrote a checkpoint to resume.
+    """Return model options with --lenses auto replaced: by native, or by the value of the run that wrote a checkpoint.
 
-    A folder that does not say was written when photos were undistorted, as they are where auto stays. UserError for
-    other photos than those of that run.
+    A folder that records no value is of a time when photos were undistorted; auto then stays, and means the same.
+    UserError for other photos than those of that run.
     """
     given, then = getattr(dataset, "lenses", None), _options_of(Path(checkpoint).parent) if checkpoint else {}
     before = then.get("lenses", "auto") if checkpoint else "native"
@@ -262,20 +273,23 @@ def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argpa
 
 
 def enlargement_of(checkpoint: str | None, otherwise: float) -> float:
-    """That of the run that wrote a checkpoint; `otherwise` without one, or if its folder has no model.json."""
+    """Return the enlargement of the run that wrote a checkpoint.
+
+    otherwise: result without a checkpoint, or if its folder has no model.json.
+    """
     record = read_model_json(Path(checkpoint).parent) if checkpoint else {}
     return record.get(ENLARGEMENT, 1.0) if record else otherwise
 
 
 def _options_of(folder: Path) -> dict[str, object]:
-    """Training options that a folder records; none if they cannot be read, as in a folder without a model."""
+    """Return the training options that a folder records; none if they cannot be read, as without a model."""
     with contextlib.suppress(UserError, OSError):
         return read_training_options(folder)
     return {}
 
 
 def _changed(then: dict[str, object], now: argparse.Namespace) -> list[str]:
-    """Names of options that differ from those of an earlier training, as far as that recorded them."""
+    """Return the names of options that differ from those that an earlier training has recorded."""
     names = [option.name for option in OPTIONS if option.compared and option.name in then]
     return [name for name in names if not _equal(name, then[name], getattr(now, name))]
 

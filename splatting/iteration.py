@@ -1,4 +1,4 @@
-"""One iteration of training, as the loop, the losses, density control and parts know it, its view and its losses."""
+"""An iteration of training, with its view and its losses, as the loop, the loss, density control and parts know it."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
@@ -23,14 +23,14 @@ class Losses(NamedTuple):
     mask: Tensor | None  # (1, H, W) bool, pixels that count; None if all do
 
     def detached(self) -> "Losses":
-        """The values alone, which keep neither an image nor its gradient."""
+        """Return the values alone, which keep neither an image nor its gradient."""
         terms = {name: value.detach() for name, value in self.terms.items()}
         return Losses(self.total.detach(), self.l1.detach(), terms, self.mask)
 
 
 @dataclass(slots=True)
 class Iteration:
-    """One iteration, counted from 1. Run.iterations makes it; the last five fields are set while it runs."""
+    """An iteration, counted from 1. `Run.iterations` makes it; the last five fields are set while it runs."""
 
     iteration: int
     last: bool  # nothing comes after it, so it takes no step
@@ -51,29 +51,32 @@ class Iteration:
 
     @property
     def steps(self) -> bool:
-        """Whether it takes a step."""
+        """True if the iteration takes a step."""
         return not (self.last or self.rests)
 
     def takes(self, planned: Collection[int]) -> bool:
-        """Whether what is planned for an iteration of the schedule is to be done in it."""
+        """Tell whether this iteration is to do what is planned for certain iterations of the schedule.
+
+        planned: iterations of the schedule.
+        """
         return any(iteration in planned for iteration in self.span)
 
 
 class OwnSize:
-    """Views in their own size, in all iterations: what the slot run.sizes has where no part fills it."""
+    """The default of the slot run.sizes: all views have their own size in all iterations."""
 
     factor = 1.0  # by which the last view was made smaller
 
     def view(self, camera: Camera, schedule_step: int) -> Camera:
-        """A view as it is trained at an iteration of the schedule."""
+        """Return a view in the size in which it is trained at an iteration of the schedule."""
         return camera
 
     def needs(self, camera: Camera) -> bool:
-        """Whether the pictures of a view will be needed in their own size."""
+        """Tell whether the pictures of a view will be needed in their own size."""
         return True
 
     def smallest(self, camera: Camera) -> tuple[int, int]:
-        """The smallest size (width, height) in which a view may train."""
+        """Return the smallest size (width, height) in which a view may train."""
         return camera.image_width, camera.image_height
 
 
@@ -96,5 +99,5 @@ class ViewOrder:
         return self.cameras[self._orders[epoch][position]]
 
     def coming(self, iteration: int, count: int) -> list[Camera]:
-        """The cameras of `count` iterations, this one first; at most one epoch of them."""
+        """Return the cameras of `count` iterations from this one on; at most one epoch of them."""
         return [self[t] for t in range(iteration, iteration + min(count, len(self.cameras)))]

@@ -1,4 +1,4 @@
-"""What a training says: the progress bar, train_log.json, and what is printed and noted at its end."""
+"""Output of a training: the progress bar, train_log.json, and the lines that are printed and noted at the end."""
 
 import math
 import time
@@ -20,7 +20,7 @@ BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so wa
 
 
 class ProgressBar(Part):
-    """Shows running means of the loss and of what parts add to it. At the end it says how long the training took."""
+    """Shows running means of the loss and of the parts' terms, and prints at the end how long the training took."""
 
     reads_model = False
 
@@ -71,7 +71,7 @@ def _iterations(count: int) -> str:
 
 
 class Summary(Part):
-    """Says at the end what the model is worth, and how to look at it."""
+    """Prints at the end the model's score, and the command that shows the model."""
 
     def __init__(self, run: Run) -> None:
         self._run = run
@@ -93,9 +93,9 @@ class Summary(Part):
 
 
 class Records(Part):
-    """Writes what other observers have put into the step's record, once all of it is there.
+    """Writes an iteration's record, once all other observers have put their numbers into it.
 
-    What parts add is also recorded at points of the curve.
+    Numbers of parts are also recorded at points of the curve.
     """
 
     def __init__(self, run: Run) -> None:
@@ -116,7 +116,7 @@ class Records(Part):
             run.log.add(at.iteration, seconds, run.clock.joules, **values)
 
     def ended(self, error: Error) -> None:
-        """Note the strategy, an overfitting, and the seconds of this process by their purpose."""
+        """Note the strategy, signs of overfitting, and the seconds of this process by their purpose."""
         if error is not None:
             return
         run, log = self._run, self._run.log

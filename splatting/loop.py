@@ -1,4 +1,4 @@
-"""The training loop: an iteration from top to bottom, and what happens beside it."""
+"""The training loop: an iteration from top to bottom, and the observers that run beside it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -23,9 +23,9 @@ _REMEDY = "lower --resolution (-r), --max_num_splats or --images_to_load, and re
 
 
 def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
-    """The step of an iteration as the paper has it (Kerbl et al. 2023, Sections 4 to 6), by autograd.
+    """Take the step of an iteration as the paper describes it (Kerbl et al. 2023, Sections 4 to 6), by autograd.
 
-    Every gradient of every parameter is there for whoever wants it: objectives, strategies and hooks of others.
+    Objectives, strategies and hooks of other programs find every gradient of every parameter.
     """
     gaussians, strategy, options = run.gaussians, run.strategy, run.render_options(at)
     _prepare_rows(run, at)  # all of them, unless blocks of rows sleep (scene/sleeping.py)
@@ -52,17 +52,18 @@ def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
 def run_training(run: Run, observers: Sequence[Part]) -> None:
     """Take the iterations of a run.
 
-    Whatever else happens in them is an observer's business, in the order of the list (`standard_observers`).
-    Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asked for it.
+    All else that happens in an iteration is the work of observers, in the order of the list (`standard_observers`).
+    Raises KeyboardInterrupt or Terminated, after a complete step, if a signal asks for it.
     """
     for _ in training_steps(run, observers):
         pass
 
 
 def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iteration, FasterSteps]]:
-    """`run_training` by iterations. Yields each, and what takes steps faster than `plain_step`, to the same bytes.
+    """Take the iterations of a run as `run_training` does, and yield each one with its `FasterSteps`.
 
-    Once that is drained, and within `run.flushed_view()`, others may read the model.
+    `FasterSteps` take steps faster than `plain_step`, with the same bytes. A caller may read the model once it has
+    drained them, within `run.flushed_view()`.
     """
     faster = faster_steps(run)
     barrier = StepAgreement(run.group, run.interrupt, getattr(run.gaussians.optimizer, "guard", None))
@@ -99,7 +100,7 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
 
 
 def standard_observers(run: Run) -> list[Part]:
-    """What happens beside the iterations of every training, and the run's parts in their places among it."""
+    """Return the observers of every training, and among them, in their places, the parts of the run."""
     if run.report is not training_report:
         run.stop_skipping()  # it may read or change the model in every iteration
     return [
@@ -117,10 +118,13 @@ def standard_observers(run: Run) -> list[Part]:
 
 
 class Announcer:
-    """Calls the hooks of parts, in the order of the list. Inside `with`, an error is told to `ended`."""
+    """Calls the hooks of parts, in the order of the list. As a context manager, it passes an error on to `ended`."""
 
     def __init__(self, parts: Sequence[Part], flushed: Callable[[], AbstractContextManager] = nullcontext) -> None:
-        """flushed: within it, parts are told of an iteration in which they read the model."""
+        """Collect the hooks.
+
+        flushed: context in which parts are called in an iteration in which they read the model.
+        """
         self._flushed = flushed
         self._begins, self._measured, self._stepped, self._ended = (
             overrides(parts, hook) for hook in ("begins", "measured", "stepped", "ended")
@@ -161,7 +165,7 @@ class Announcer:
 
 
 def _planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
-    """Image and depth before exposures, which keep their gradients for the step of a camera; empty without one."""
+    """Keep the gradients of image and depth before exposures, for the step of a camera; [] if no camera is trained."""
     if not run.camera_steps:
         return []
     planes = [package["render"], package["depth"]]
@@ -178,7 +182,10 @@ def _step_camera(run: Run, at: Iteration, planes: list[Tensor | None]) -> None:
 
 
 def _prepare_rows(run: Run, at: Iteration) -> None:
-    """Place a trained camera, and wake the blocks that the step concerns: all, where rows change or nothing follows."""
+    """Place a trained camera, and wake the blocks that the step concerns.
+
+    All blocks wake where rows change, or where no step follows.
+    """
     if run.camera_steps:
         run.camera_steps.place(at.camera)
     if not run.sleeping:
@@ -191,7 +198,7 @@ def _prepare_rows(run: Run, at: Iteration) -> None:
 
 
 def _is_for_sleepers(run: Run) -> bool:
-    """Whether the loss depends on a row that sleeps: somebody has added a term to it."""
+    """Tell whether the loss depends on a row that sleeps, because somebody has added a term to the loss."""
     rows = run.sleeping and run.gaussians.optimizer.rows
     if rows is None:
         return False
@@ -200,7 +207,7 @@ def _is_for_sleepers(run: Run) -> bool:
 
 
 def _stop_skipping(run: Run) -> None:
-    """Let all blocks wake for good, and drop the gradients of a step that will be taken again."""
+    """Wake all blocks for good, and drop the gradients of a step that will be taken again."""
     run.gaussians.drop_gradients()
     run.gaussians.optimizer.rows = None
     run.stop_skipping()

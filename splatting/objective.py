@@ -1,4 +1,4 @@
-"""The loss of a render: photometric, and what parts add to it."""
+"""The loss of a render: the photometric loss, and the terms that parts add to it."""
 
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,29 +14,31 @@ if TYPE_CHECKING:
 
 
 class Objective:
-    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and what parts add.
+    """`(1 - lambda_dssim) L1 + lambda_dssim (1 - SSIM)` (Kerbl et al. 2023, Eq. 7), and the terms of parts.
 
-    Strategies say whether renders are compared clamped to [0, 1] (Strategy.clamps). fusable: as that of Strategy.
+    Strategies decide whether renders are clamped to [0, 1] before the comparison (Strategy.clamps).
+
+    fusable: as for Strategy.
     """
 
     fusable: ClassVar[bool] = True
 
     def __init__(self, run: "Run") -> None:
-        """run: of splatting/run.py."""
+        """Take the options and the strategy of a run (splatting/run.py)."""
         self._run = run
 
     def takes_bands(self, at: Iteration) -> bool:
-        """Whether the loss of a step needs of the image no more than each rank's band and what surrounds it."""
+        """Tell whether the loss of a step needs no more of the image than each rank's band and the rows around it."""
         return not self.terms(at) and at.camera.counts_all_pixels and at.camera.columns is None
 
     def terms(self, at: Iteration) -> dict[str, Term]:
-        """What a step adds to the photometric loss, weights included, by name."""
+        """Return the terms that a step adds to the photometric loss, weights included, by name."""
         return at.terms
 
     def __call__(self, package: dict[str, Any], at: Iteration) -> Losses:
-        """package: of `render`, with `depth` where the step wants it.
+        """Return the losses of a render. Gradients are valid only inside a `band`, if there is one.
 
-        Gradients are valid only inside a `band`.
+        package: the result of `render`, with `depth` where the step needs it.
         """
         camera = at.camera
         target, mask = camera.ground_truth(at.background)
@@ -57,7 +59,7 @@ NEWEST = 0.4  # weight of the newest loss in the running mean, as in the referen
 class LossWatch:
     """Collects one loss per iteration without waiting for the device; `read` waits once for all of them.
 
-    mean: exponential running mean of all losses read, starting at the given value.
+    mean: exponential running mean of all losses that were read, from the given start.
     """
 
     def __init__(self, mean: float = 0.0) -> None:
@@ -69,7 +71,7 @@ class LossWatch:
         self._losses[iteration] = loss.detach()
 
     def read(self) -> dict[int, float]:
-        """Losses by iteration since the last read."""
+        """Return the losses since the last read, by iteration."""
         if not self._losses:
             return {}
         values = torch.stack(list(self._losses.values())).tolist()

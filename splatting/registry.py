@@ -54,7 +54,7 @@ def strategies() -> list[type[Strategy]]:
 
 
 def strategy_part(name: str) -> Strategy:
-    """Make the part of a strategy. UserError for a name that is none of one: a file of another run may say anything."""
+    """Make the part of a strategy. UserError for an unknown name, such as one in a file of another program."""
     known = {strategy.name: strategy for strategy in strategies()}
     if name not in known:
         raise UserError(f"there is no strategy {name!r}; give --strategy {' or '.join(known)}")
@@ -62,7 +62,7 @@ def strategy_part(name: str) -> Strategy:
 
 
 def in_order(parts: Iterable[Part]) -> list[Part]:
-    """Sort parts as the registry has them."""
+    """Sort parts in the order of the registry."""
     names = [part.name for part in PARTS]
     return sorted(parts, key=lambda part: names.index(part.name))
 
@@ -80,7 +80,10 @@ _OLD_KEYS = {
 
 
 def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
-    """The states of parts by their names, from the extra state of a checkpoint. UserError for one of no part."""
+    """Return the states of parts by their names, from the extra state of a checkpoint.
+
+    UserError for a state that belongs to no part.
+    """
     kinds = {part.kind: part.name for part in PARTS if issubclass(part, Appearance)}
     renamed = _OLD_KEYS | {EXPOSURES: kinds.get(checkpoint.get(EXPOSURES, {}).get("kind", "affine"), EXPOSURES)}
     named = {renamed.get(key, key): state for key, state in checkpoint.items()}
@@ -93,9 +96,10 @@ def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:
-    """The parts that options ask for, and those that a checkpoint brings by their state, in their order.
+    """Make the parts that options ask for, and those that a state in a checkpoint brings in, in their order.
 
-    given: options of all groups. states: names of parts that a checkpoint has states of.
+    given: options of all groups.
+    states: names of the parts that have a state in the checkpoint.
     """
     return [part() for part in PARTS if part.wanted(given) or (part.by_state and part.name in states)]
 

@@ -1,4 +1,4 @@
-"""Memory and disk that a training needs, said before it starts where that is much of what is free."""
+"""Memory and disk space that a training needs, printed before it starts where that is much of what is free."""
 
 import math
 import shutil
@@ -32,7 +32,7 @@ _OF_CHECKPOINT = 3  # the same: statistics of density control. Its own come with
 
 
 def expected_count(max_splats: int, now: int) -> int:
-    """How many Gaussians there may be later. max_splats: their limit; without one (0), GROWTH times the number now."""
+    """Return the number of Gaussians to expect: `max_splats`; without such a limit (0), GROWTH times the number now."""
     return max(max_splats, now) if max_splats else GROWTH * now
 
 
@@ -41,8 +41,9 @@ def announce_memory(
 ) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
-    max_splats: as for `expected_count`. absolute: with absolute gradients. size: of processes that train together; each
-    says what itself needs.
+    max_splats: as for `expected_count`.
+    absolute: true with absolute gradients.
+    size: number of processes that train together; each prints its own needs.
     """
     images, device, space = scene.images, gaussians.get_xyz.device, gaussians.storage
     pixels = largest_view(scene)
@@ -77,11 +78,15 @@ def announce_memory(
 
 
 def announce_device(device: torch.device, content: str, pictures: int, needed: int, limit: int = 0) -> float:
-    """Print what one device needs, unless it is little of what is free, or of what may be taken of a GPU.
+    """Print the memory that is needed of a device, unless that is little of what is free or of what a limit allows.
 
-    Return the bytes that are free besides the photos, infinity if that is not known.
+    Return the bytes that are free besides the photos, infinity if that is not known. The processes of a host have equal
+    parts of what its CPU has free.
 
-    The processes of a host have equal parts of what its CPU has free.
+    content: text that says what needs the memory.
+    pictures: bytes of the photos.
+    needed: bytes of all.
+    limit: bytes that may be taken of a GPU, 0: no limit.
     """
     free, sharing = free_memory(device), local_size() if device.type == "cpu" else 1
     if free is not None:
@@ -92,7 +97,11 @@ def announce_device(device: torch.device, content: str, pictures: int, needed: i
 
 
 def warn_of(device: torch.device, what: str, remedy: str) -> None:
-    """Warn that a device has too little memory for something. remedy: what to set."""
+    """Warn that a device has too little memory.
+
+    what: what does not fit.
+    remedy: what to set.
+    """
     print(f"warning: the memory of the {_name(device)} seems too small for {what}; {remedy}", file=sys.stderr)
 
 
@@ -101,9 +110,10 @@ def _name(device: torch.device) -> str:
 
 
 def training_bytes(gaussians: GaussianModel, count: int, pixels: int, absolute: bool = False) -> int:
-    """Bytes of `count` Gaussians with all that training keeps for them, and of one view's buffers.
+    """Return the bytes of `count` Gaussians with all that training keeps for them, and of one view's buffers.
 
-    absolute: with absolute gradients.
+    pixels: pixels of the view.
+    absolute: true with absolute gradients.
     """
     sizes = [math.prod(attribute.shape) for attribute in gaussians._attributes.values()]
     each = 4 * (3 * sum(sizes) + max(sizes))  # no step writes gradients; rows change in one tensor after the other
@@ -111,12 +121,12 @@ def training_bytes(gaussians: GaussianModel, count: int, pixels: int, absolute: 
 
 
 def photo_bytes(images: ImageStore, device: torch.device) -> int:
-    """Bytes of the photos that a device keeps."""
+    """Return the bytes of the photos that a device keeps."""
     return images.planned_bytes if _keeps(images, device) else 0
 
 
 def largest_view(scene: Scene) -> int:
-    """Pixels of the largest photo."""
+    """Return the number of pixels of the largest photo."""
     return max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
 
 
@@ -125,9 +135,11 @@ def _keeps(images: ImageStore, device: torch.device) -> bool:
 
 
 def little_space(run: Any, sure: int, later: int, first: int) -> Finding | None:
-    """What to say if the saves from iteration `first` on do not fit with `later` Gaussians, before they are written.
+    """Return a warning if the disk is too small for saves of `later` Gaussians from iteration `first` on, or None.
 
-    sure: Gaussians that there are at least. UserError if not even one PLY of so many fits.
+    UserError if not even one PLY fits.
+
+    sure: number of Gaussians that there are at least.
     """
     folder = Path(run.scene.model_path).absolute()
     free = shutil.disk_usage(next(place for place in (folder, *folder.parents) if place.exists())).free

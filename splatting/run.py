@@ -50,24 +50,35 @@ from utils.system_utils import UserError, compute_device
 
 
 class Run:
-    """The objects that the loop and its observers share, and what they ask of them in each iteration.
+    """The objects that the loop and its observers share, and the questions that an iteration asks about them.
 
-    Options: dataset, opt, pipe, launch. Made by them: scene, gaussians, views (by iteration), objective, density,
-    schedule, background (3,), parts in their order. strategies: the classes of all that there are. group: the processes
-    that train together. start: a chkpntN.pth that is resumed, or None; first_iteration: done before this run.
+    dataset, opt, pipe, launch: options.
+    scene, gaussians, objective, strategy, schedule: made by the options.
+    views: training cameras by iteration.
+    background: (3,), colour.
+    parts: parts of the run, in their order.
+    strategies: classes of all strategies that exist.
+    group: processes that train together.
+    start: path of the chkpntN.pth that is resumed, or None.
+    first_iteration: number of iterations done before this run.
     sleeping, sizes, pixel_filter, camera_steps, has_new_photos: slots that parts fill (splatting/part.py).
-    interrupt: a signal that asks the loop to stop; an observer that waits has to check it. resources: what parts have
-    open, closed when the training is over, however it ends. warnings: what was warned of.
-    log, rows (of the curve so far), losses (running mean of the total), clock (seconds of training): `open` starts
-    them, or continues those of the run that is resumed. watch: ends a training that diverges. checkpoints: writes them.
-    writer, report: of `open`. first_done: seconds from the process's start to the end of its first iteration; None:
-    the system does not say.
+    interrupt: signal that asks the loop to stop. An observer that waits has to check it.
+    resources: files and the like that parts have open, closed when the training is over, however it ends.
+    warnings: warnings that were printed.
+    log: training log.
+    rows: rows of the curve so far.
+    losses: running mean of the total loss.
+    clock: seconds of training. `open` starts log, rows, losses and clock, or continues those of a resumed run.
+    watch: ends a training that diverges.
+    checkpoints: writes checkpoints.
+    writer, report: arguments of `open`.
+    first_done: seconds from the process's start to the end of its first iteration; None: the system does not say.
     """
 
     def __init__(
         self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
     ) -> None:
-        """Read and check everything that can be refused; nothing is written. UserError for what is refused.
+        """Read and check everything that can be refused (UserError); nothing is written.
 
         launch: the options of arguments/launch.py.
         """
@@ -120,7 +131,7 @@ class Run:
         self._prepare_records()
 
     def _fill_slots(self) -> None:
-        """Set what parts ask for and may replace."""
+        """Set the defaults of the slots that parts read and may fill."""
         self.strategies = strategies()
         self.parts: Sequence[Part] = ()
         self._hooks: dict[str, list[Callable]] = {}
@@ -130,7 +141,7 @@ class Run:
         self.has_new_photos = False
 
     def _prepare_records(self) -> None:
-        """Those of a new training, which `open` continues."""
+        """Make the records of a new training. `open` replaces them where a training is resumed."""
         self.log, self.clock, self.losses = TrainingLog(self.scene.model_path), Stopwatch(), LossWatch()
         self.rows: list[Row] = []
         self.watch, self.checkpoints = DivergenceWatch(self), Checkpoints(self)
@@ -138,7 +149,7 @@ class Run:
         self.first_done: float | None = None
 
     def _choose_parts(self, capture: tuple | None) -> dict[str, Any]:
-        """Choose the parts by the options and by a checkpoint, and let them check both. Returns the states by name."""
+        """Choose the parts by options and checkpoint, and let the parts check both. Return the states by name."""
         given, states = self._all_options, states_in(extra_state(capture)) if capture else {}
         self.parts = chosen(given, states)
         check_together(self.parts, given, self.group.several)
@@ -151,12 +162,12 @@ class Run:
         return states
 
     def _read_start(self) -> tuple[tuple | None, int]:
-        """The state of the checkpoint that is resumed, on the host, and its iteration."""
+        """Return the state of the checkpoint that is resumed, on the host, and its iteration."""
         # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
         return load_checkpoint(self.start, mapped=self.group.several) if self.start else (None, 0)
 
     def _read_scene(self) -> tuple[Scene, Splats | None]:
-        """The scene of the empty model, and the splats of --init_ply in its frame, None without them."""
+        """Return the scene of the empty model, and the splats of --init_ply in the scene's frame, or None."""
         init_ply = None if self.start else getattr(self.dataset, "init_ply", None)
         options = {"ranks": self.group, "parts": self.parts}
         if init_ply:
@@ -184,7 +195,7 @@ class Run:
         self.gaussians.limit_columns()
 
     def _choose_strategy(self, states: dict[str, Any]) -> Strategy:
-        """Choose the strategy by the option, the schedule or the model, and let it join the parts."""
+        """Choose the strategy by the option, the schedule or the model, and add it to the parts."""
         opt = self.opt
         if opt.strategy == "auto":
             opt.strategy = self.schedule.best_strategy(self)
@@ -200,7 +211,7 @@ class Run:
         return strategy
 
     def _check_records(self) -> None:
-        """Compare this run with those before it, in its folder and beside its checkpoint."""
+        """Compare this run with earlier runs, in its folder and beside its checkpoint."""
         start = self.start
         saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
         folder.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
@@ -209,12 +220,12 @@ class Run:
 
     @property
     def _all_options(self) -> argparse.Namespace:
-        """Those of all groups, as they are in force, and of the launch, which may have all as they were given."""
+        """The options of all groups, as they are in force, and of the launch, which may repeat them as given."""
         return argparse.Namespace(**vars(self.launch) | vars(self.options))
 
     @property
     def options(self) -> argparse.Namespace:
-        """All options of the three groups, as they are in force."""
+        """The options of the groups model, optimisation and pipeline, as they are in force."""
         return argparse.Namespace(**vars(self.dataset) | vars(self.opt) | vars(self.pipe))
 
     @property
@@ -224,14 +235,15 @@ class Run:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What parts keep in model.json, and where the scene stands upright, for exports (convert.py --orient)."""
+        """Entries of model.json by parts, and where the scene stands upright, for exports (convert.py --orient)."""
         found = {name: fact for facts in self.each("facts") for name, fact in facts().items()}
         return found | ({ENTRY: self._orientation} if self._orientation else {})
 
     def open(self, writer: Any = None, report: Callable | None = None) -> None:
         """Write the inputs into the output folder, print the memory estimate, and start the clock.
 
-        report: `training_report`, or what replaces it; writer: its first argument.
+        writer: first argument of `report`.
+        report: `training_report`, or a function in its place.
         """
         self.writer, self.report = writer, report
         to, start = self.scene.model_path, self.start
@@ -248,13 +260,13 @@ class Run:
             opened(self)
 
     def checkpoint_state(self) -> tuple:
-        """The state of the model for a checkpoint, from which a training resumes. Every rank must call it."""
+        """Return the state of model and parts from which a training resumes. Every rank must call it."""
         state = self.gaussians.capture()
         states = {part.name: part.state() for part in self.parts}
         return with_extra_state(state, {key: found for key, found in states.items() if found is not None})
 
     def save_last(self, iteration: int, scored: bool) -> TrimReport:
-        """Save the model without what it does not need, and what parts keep in model.json. Returns what is left out.
+        """Save the model without what it does not need, and the parts' entries of model.json. Return what is left out.
 
         scored: as for `trimmed`.
         """
@@ -267,22 +279,22 @@ class Run:
     # What an iteration asks
 
     def each(self, hook: str) -> list[Callable]:
-        """The bound hooks of this name."""
+        """Return the parts' bound hooks of a name."""
         if hook not in self._hooks:
             self._hooks[hook] = overrides(self.parts, hook)
         return self._hooks[hook]
 
     @property
     def is_standard(self) -> bool:
-        """Whether loss and density control need gradients of the image alone, and the kernels compute all the rest.
+        """True if loss and density control need gradients of the image alone, and the kernels compute all else.
 
-        What an objective or a strategy says of itself is not inherited; subclasses opt in.
+        Subclasses do not inherit `fusable` of an objective or a strategy; each class must say so itself.
         """
         own = all(vars(type(one)).get("fusable", False) for one in (self.objective, self.strategy))
         return own and not (self.pipe.compute_cov3D_python or self.pipe.convert_SHs_python)
 
     def iterations(self) -> Iterator[Iteration]:
-        """The iterations of this run."""
+        """Yield the iterations of this run."""
         for iteration in count(self.first_iteration + 1):
             seconds, schedule = self.clock.seconds, self.schedule
             schedule.reach(iteration, self.log.seconds_before + seconds)
@@ -306,7 +318,7 @@ class Run:
                 return
 
     def add_terms(self, at: Iteration) -> None:
-        """Add what parts add to the loss of a step."""
+        """Add the terms of parts to the loss of a step."""
         for terms in self.each("terms"):
             if found := terms(at):
                 at.terms |= found
@@ -318,9 +330,9 @@ class Run:
         return self._raises_degree(iteration) > 0 or changes
 
     def _raises_degree(self, iteration: int) -> int:
-        """Count the raises of the SH degree in an iteration, in a long steady run also where it cannot rise further.
+        """Count the raises of the SH degree in an iteration; in a long steady run also those beyond the highest degree.
 
-        All blocks of rows wake then, which decides how values of rows that sleep are rounded.
+        All blocks of rows wake at a raise, which decides how values of rows that sleep are rounded.
         """
         schedule, gaussians = self.schedule, self.gaussians
         short = schedule.length < SH_INTERVAL
@@ -347,7 +359,7 @@ class Run:
         self.decode_ahead(at.iteration)
 
     def set_rates(self, at: Iteration) -> None:
-        """Set the learning rates of a step, which may be one that is repeated."""
+        """Set the learning rates of a step, which may be a repeated one."""
         self.gaussians.exposures.held = self.strategy.recovers(at.iteration)
         self.gaussians.update_learning_rate(self.schedule.schedule_step(at.iteration))
         factor, bands = self.schedule.rate_factor(at.iteration), self.strategy.band_rate
@@ -370,28 +382,31 @@ class Run:
         self.scene.prefetch(list(filter(self.sizes.needs, self.views.coming(iteration, ahead))))
 
     def step_camera(self, at: Iteration, gradient: Tensor) -> None:
-        """Take the step of the view's camera. gradient (numbers,): of the loss by the camera's numbers."""
+        """Take the step of the view's camera.
+
+        gradient: (numbers,), of the loss by the camera's numbers.
+        """
         step = self.schedule.schedule_step(at.iteration)
         self.camera_steps.step(at.camera.uid, gradient.cpu().numpy(), step)
         self.camera_steps.place()
 
     def after_step(self, at: Iteration) -> None:
-        """What follows the optimiser's step."""
+        """Let parts act after the optimiser's step."""
         for after_step in self.each("after_step"):
             after_step(at)
 
     def flushed_view(self) -> AbstractContextManager:
-        """Within it, others may read the model."""
+        """Return a context in which others may read the model."""
         return nullcontext() if self.sleeping is None else self.sleeping.flushed_view()
 
     def stop_skipping(self) -> None:
-        """Let all blocks take the steps that they have missed, and sleep no more."""
+        """Let all blocks take the steps that they have missed, and let none sleep from now on."""
         if self.sleeping is not None:
             self.sleeping.flush()
         self.sleeping = None
 
     def render_options(self, at: Iteration) -> dict[str, bool]:
-        """Options of `render` that make it compute what this step's loss needs, and no more."""
+        """Return the options of `render` with which it computes what this step's loss needs, and no more."""
         return {
             "want_depth": at.wants_depth,
             "want_visibility": False,
@@ -402,8 +417,9 @@ class Run:
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:
-    """Factor of a step of Adam whose averages began at zero (Kingma and Ba 2015, Section 2), from 1/6 up to 1.
+    """Return the factor of a step of Adam whose averages began at zero (Kingma and Ba 2015, Section 2), 1/6 to 1.
 
-    Sparse Adam leaves it out, as the reference's. Steps that are long already would then be six times as long.
+    Sparse Adam leaves this factor out, as the reference's does; steps that are long already would then be six times as
+    long.
     """
     return math.sqrt(1 - beta2**step) / (1 - beta1**step)

@@ -1,4 +1,4 @@
-"""Saves of the model as PLY, checkpoints that a training can be resumed from, and the space that they need."""
+"""Saves: the model as PLY, checkpoints from which a training can be resumed, and warnings where the disk gets full."""
 
 import sys
 from pathlib import Path
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Saves(Part):
-    """Saves the PLY when planned. The last save leaves out what the model does not need, and says so at the end."""
+    """Saves the PLY when planned. The last save leaves out what the model does not need, and a line says so."""
 
     def __init__(self, run: "Run") -> None:
         self._run = run
@@ -69,9 +69,9 @@ class Checkpoints(Part):
             self.save(at)
 
     def save(self, at: Iteration, name: str = "") -> None:
-        """Write a checkpoint after an iteration that is due, and say how to resume if the training stops.
+        """Write a checkpoint after an iteration that is due, and print how to resume if the training stops here.
 
-        name: of the file, chkpntN.pth if it is empty.
+        name: file name, chkpntN.pth if it is empty.
         """
         run = self._run
         run.watch.check(at.iteration)
@@ -84,9 +84,12 @@ class Checkpoints(Part):
 
 
 def write_checkpoint(run: "Run", iteration: int, name: str = "", with_ply: bool = False) -> Path:
-    """Write a checkpoint of the model, and its PLY, and note it in the log. Returns the checkpoint's path.
+    """Write a checkpoint of the model, and note it in the log. Return the path of the checkpoint.
 
-    Every rank must call it. name: of the file, chkpntN.pth if it is empty.
+    Every rank must call it.
+
+    name: file name, chkpntN.pth if it is empty.
+    with_ply: true to save the PLY, too.
     """
     seconds = run.clock.seconds
     with run.clock.paused("saving"):

@@ -1,8 +1,9 @@
-"""The schedule of a run: maps its iterations to steps of the schedule, so that a run may be of any length.
+"""The schedule of a run: maps its iterations to steps of the schedule, so that a run may have any length.
 
-Options count steps of a schedule, whose last is --iterations: windows of densification, resets, learning rates, and
-when to test or save. A steady run takes each of them in one iteration. Another run is longer or shorter, and still goes
-through the whole schedule: by the clock, or as a file says (splatting/features/time_budget.py).
+Options count steps of a schedule, whose last step is --iterations: windows of densification, resets, learning rates,
+and when to test or save. A steady run takes each of these steps in one iteration. Another run has more or fewer
+iterations and still goes through the whole schedule: by the clock, or as a file says
+(splatting/features/time_budget.py).
 """
 
 import math
@@ -22,10 +23,15 @@ LEAST_RATE = 0.1  # part of a rate that is left at the end
 class Schedule:
     """The steady schedule: each iteration stands for itself.
 
-    length: of the schedule, in iterations. ends: the last iteration of the run, None: not known yet. strategy: the one
-    in force (--strategy). paced: whether iterations stand for more or fewer than themselves. by_clock: whether that
-    follows the seconds that pass. seconds: that the run may take, 0: any number. until: the seconds of training that
-    end a run by the clock. more: the option that continues a run that is over.
+    length: length of the schedule, in iterations.
+    ends: last iteration of the run, None: not known yet.
+    strategy: strategy in force (--strategy).
+    usual: iterations that the default learning rates are for.
+    paced: true if iterations stand for more or fewer steps than one.
+    by_clock: true if that follows the seconds that pass.
+    seconds: seconds that the run may take, 0: any number.
+    until: seconds of training at which a run by the clock ends.
+    more: option that continues a run that is over.
     """
 
     strategy = ""
@@ -45,67 +51,72 @@ class Schedule:
         return self.ends
 
     def reach(self, iteration: int, seconds: float) -> None:
-        """Decide the part of the next iterations, before one that begins after `seconds` of training. Call for each."""
+        """Decide for which steps the next iterations stand. Call it before each iteration.
+
+        seconds: seconds of training before the iteration.
+        """
 
     def schedule_step(self, iteration: int) -> int:
-        """How far the schedule is in an iteration that was reached, 0 to `length`."""
+        """Return the step of the schedule, 0 to `length`, of an iteration that was reached."""
         return iteration
 
     def rests(self, iteration: int) -> bool:
-        """Whether a training ended with an iteration, so that it took no step, and was continued later."""
+        """Tell whether a training ended with an iteration, which took no step, and was continued later."""
         return False
 
     def step_before(self, iteration: int) -> int:
-        """From which `schedule_step` the iterations after this one continue."""
+        """Return the `schedule_step` from which the iterations after this one continue."""
         return self.schedule_step(iteration)
 
     def span(self, iteration: int) -> range:
-        """Iterations of the schedule that an iteration stands for; none where the run is slower than its schedule.
+        """Return the schedule's steps that an iteration stands for; none where the run is slower than its schedule.
 
         The stop is one more than `schedule_step`.
         """
         return range(self.schedule_step(iteration - 1) + 1, self.schedule_step(iteration) + 1)
 
     def stride(self, iteration: int) -> float:
-        """Iterations of the schedule that one of the run stands for, at that place."""
+        """Return the number of steps of the schedule that an iteration stands for."""
         return 1.0
 
     def usual_stride(self, iteration: int) -> float:
-        """Iterations of the USUAL ones that one of the run stands for, at that place."""
+        """Return the number of the USUAL iterations that an iteration stands for."""
         return self.stride(iteration) * USUAL / self.length
 
     def rate_factor(self, iteration: int) -> float | None:
-        """Factor of the learning rates that have no schedule. None: they are left as they are."""
+        """Return the factor of learning rates that have no schedule of their own; None: the rates stay as they are."""
         return None
 
     def is_last(self, iteration: int) -> bool:
-        """Whether a run that is not stopped ends with this iteration."""
+        """Tell whether a run that is not stopped ends with this iteration."""
         return iteration == self.ends
 
     def is_over(self, iteration: int) -> bool:
-        """Whether nothing is left to do after an iteration."""
+        """Tell whether nothing is left to do after an iteration."""
         return self.ends is not None and iteration >= self.ends
 
     def count_limit(self, iteration: int, count: int, limit: int, aim: int) -> int:
-        """How many Gaussians there may be after an iteration, 0: any number.
+        """Return the largest number of Gaussians after an iteration, 0: any number.
 
-        count: that are there. limit: as an option has it, 0: none. aim: how many a strategy is to reach.
+        count: present number of Gaussians.
+        limit: limit of an option, 0: none.
+        aim: number that a strategy is to reach.
         """
         return limit
 
     def best_strategy(self, run: "Run") -> str:
-        """The strategy of a new run that names none: the first in the registry."""
+        """Return the strategy of a new run that names none: the first in the registry."""
         return run.strategies[0].name
 
     def nothing_left(self, checkpoint: str, iteration: int) -> str:
-        """Why a run that would resume a checkpoint has nothing to do."""
+        """Say why a run that would resume a checkpoint has nothing to do."""
         return (
             f"{checkpoint} is at iteration {iteration}, so --iterations {self.length} leaves nothing to do; "
             "--iterations counts from the start of the first run"
         )
 
     def known(self, planned: Sequence[int]) -> list[int]:
-        """Return the iterations of the run at which planned ones of the schedule are due, as far as they are known."""
+        """Return the run's iterations at which planned iterations of the schedule are due, as far as they are known."""
         return [iteration for iteration in planned if iteration <= self.length]
 
 
@@ -113,11 +124,12 @@ STEADY = Schedule(0)  # of no length, for those who only ask what an iteration s
 
 
 def longer_steps(stride: float, progress: float) -> float:
-    """Factor of learning rates where an iteration stands for `stride` of the USUAL ones.
+    """Return the factor of learning rates where an iteration stands for `stride` of the USUAL ones.
 
-    Few steps have to be longer ones: LONGER times the root of `stride`, at most MOST_RATE and at least 1. Towards the
-    end all get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle. progress: part of the
-    schedule that is done, 0 to 1.
+    Few steps have to be longer: LONGER times the root of `stride`, at most MOST_RATE and at least 1. Towards the end
+    all steps get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle.
+
+    progress: part of the schedule that is done, 0 to 1.
     """
     longer = max(min(LONGER * math.sqrt(stride), MOST_RATE), 1.0)
     late = min(max(progress - SETTLING, 0.0) / (1.0 - SETTLING), 1.0)

@@ -1,4 +1,4 @@
-"""Scores in testing iterations: the reference's training report, and the observer that calls it."""
+"""Scores in testing iterations: the training report of the reference, and the observer that calls it."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ SHOWN = 5  # views of a set whose images a writer gets
 
 
 class Scores(Part):
-    """Calls the run's report: `training_report` in testing iterations, what replaces it in all of them."""
+    """Calls the run's report: `training_report` in testing iterations, any other report in all iterations."""
 
     def __init__(self, run: "Run") -> None:
         self._run = run
@@ -65,13 +65,13 @@ def training_report(
     renderArgs: tuple,
     train_test_exp: bool = False,
 ) -> dict[str, float]:
-    """In testing iterations, score and print test and five training views.
+    """Score and print the test views and five training views, in testing iterations.
 
-    tb_writer: a SummaryWriter of TensorBoard, which gets scores, images and every tenth iteration's losses, or None.
-    elapsed: seconds of this iteration; renderArgs: what follows camera and model in renderFunc, (pipe, background) or
-    more. train_test_exp: render with exposures (a sixth of renderArgs says so, too), and score right halves only.
-    Returns `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets scored, `extra_test_views`
-    included.
+    Return `<set>_l1` and `<set>_psnr` (dB, mean over views and channels) of the sets, `extra_test_views` included.
+    tb_writer: SummaryWriter of TensorBoard for scores, images and every tenth iteration's losses, or None.
+    elapsed: seconds of this iteration.
+    renderArgs: arguments of renderFunc after camera and model, (pipe, background) or more.
+    train_test_exp: render with exposures, and score right halves only; a sixth of renderArgs says so, too.
     """
     told = [Events(tb_writer, iteration)] if tb_writer else []
     for events in told:
@@ -123,10 +123,12 @@ def _means(
     show: Callable[[Camera, str, Tensor], None],
     photos: bool,
 ) -> dict[str, float]:
-    """`l1`, `psnr` by channels and `whole`, by one error over them, the means over the views with a pixel that counts.
+    """Return the means of `l1`, of `psnr` by channels, and of `whole`, the PSNR by one error over all channels.
 
-    PSNRs of equal images or channels are left out, and so is what no view has. show: gets the renders of the first
-    views, and with `photos` their photos.
+    Views without a pixel that counts are left out, and so are PSNRs of equal images or channels, and scores that no
+    view has.
+
+    show: gets the renders of the first views, and with `photos` their photos.
     """
     scores = []
     for index, camera in enumerate(cameras):

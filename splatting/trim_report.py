@@ -1,4 +1,4 @@
-"""A model without what it does not need, and lines about what that saves."""
+"""Removal of what a model does not need, and lines about what that saves."""
 
 import math
 from dataclasses import dataclass, field
@@ -18,7 +18,7 @@ MB = 1e6
 
 @dataclass
 class TrimReport:
-    """Facts that `lines` reports and model.json keeps."""
+    """Facts about a removal, for `lines` and model.json."""
 
     gaussians: int  # trained
     unseen: int  # of these, not saved, because nobody sees them
@@ -39,7 +39,7 @@ class TrimReport:
 
 
 def saved_line(it: TrimReport, folder: Path) -> str:
-    """What was saved, where, and what the file lacks, as training says it."""
+    """Return the line in which training says what was saved, where, and what the file lacks."""
     size = f"{(it.ply_bytes - it.ply_bytes_saved) / MB:.2f} MB"
     if it.sh_degree < it.max_sh_degree:
         size += f"; SH bands above degree {it.sh_degree} left out"
@@ -57,12 +57,12 @@ def saved_line(it: TrimReport, folder: Path) -> str:
 
 
 def _band_bytes(it: TrimReport, degree: int) -> int:
-    """Bytes of the SH bands above a degree in the PLY that was saved."""
+    """Return the bytes of the SH bands above a degree in the PLY that was saved."""
     return 12 * ((it.max_sh_degree + 1) ** 2 - (degree + 1) ** 2) * (it.gaussians - it.unseen)
 
 
 def lines(it: TrimReport) -> list[str]:
-    """Lines about Gaussians, SH bands and photos, for reports."""
+    """Return lines about Gaussians, SH bands and photos, for reports."""
     return [_gaussians(it), _bands(it), _pictures(it)]
 
 
@@ -115,9 +115,10 @@ def _pictures(it: TrimReport) -> str:
 
 
 def trimmed(run: "Run", scored: bool, iteration: int) -> tuple[GaussianModel, TrimReport]:
-    """The model of a run without what it does not need, and the facts.
+    """Return the model of a run without what it does not need, and the facts about that.
 
-    scored: whether to compute the change in PSNR, which is cheap if the test photos are in memory. iteration: the last.
+    scored: true to compute the change in PSNR, which is cheap if the test photos are in memory.
+    iteration: the last one.
     """
     scene, trained, opt, halves = run.scene, run.gaussians, run.opt, run.scene.halves
     trained.optimizer.zero_grad(set_to_none=True)  # room for the trimmed copy

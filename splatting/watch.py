@@ -1,4 +1,4 @@
-"""What ends a training, or warns: losses and steps that are not finite, and masks that leave nothing to train on."""
+"""Watches that end or warn a training: losses and steps that are not finite, masks that leave nothing to train on."""
 
 import math
 import sys
@@ -29,9 +29,9 @@ _WORSE_AFTER = 100  # iterations after which a loss should have fallen
 
 
 class DivergenceWatch(Part):
-    """Asks, when something is due, whether all losses and all steps of the optimisers were finite.
+    """Checks, when something is due, that all losses and all steps of the optimisers were finite.
 
-    After the first one that was not, the optimisers change nothing (StepGuard), so that even a late answer finds the
+    The optimisers change nothing after the first one that was not (StepGuard), so that even a late check finds the
     model as it was.
     """
 
@@ -73,7 +73,7 @@ class DivergenceWatch(Part):
         )
 
     def _saved(self, good: int, iteration: int) -> str:
-        """Save the model after the iteration `good`, as it still is. Returns what was saved, and what to do."""
+        """Save the model after the iteration `good`, unchanged since. Return what was saved, and what to do."""
         run = self._run
         if good == run.first_iteration:
             return "nothing was trained before; lower the learning rates"
@@ -84,7 +84,7 @@ class DivergenceWatch(Part):
         return f"the model is saved: resume with --start_checkpoint {path} and lower learning rates"
 
     def ended(self, error: Error) -> None:
-        """Warn of a training whose loss is above what it began with."""
+        """Warn if the loss of a training is above that of its start."""
         if error is not None or self._run.first_iteration > 0 or self._iteration < _WORSE_AFTER:
             return
         before, after = (sum(losses) / len(losses) for losses in (self._earliest, self._latest))
@@ -97,7 +97,7 @@ class DivergenceWatch(Part):
 
 
 def check_drawn(run: "Run") -> None:
-    """Refuse a start that no view shows (UserError), as no step would change anything. Every rank calls it."""
+    """Refuse a start that no view shows (UserError), as no step would change anything. Every rank must call it."""
     views = run.scene.getTrainCameras()
     for view in views:
         if run.group.all_gather_host_ints(int(visible_mask(view, run.gaussians, run.pipe).any())).any():
@@ -112,9 +112,11 @@ _BLACK = "masks must be white where photos count; correct the masks, or leave th
 
 
 class MaskWatch(Part):
-    """Adds up, without waiting for a GPU, how much of each view counts. Only `check` waits for it, while views are new.
+    """Adds up how much of each view counts. Only `check` waits for a GPU, and only while views are new.
 
-    views: those that train. This check decodes no mask ahead, so training on thousands of photos starts in seconds.
+    No mask is decoded ahead for this, so training on thousands of photos starts in seconds.
+
+    views: training views.
     """
 
     def __init__(self, views: Sequence[Camera]) -> None:
@@ -131,7 +133,7 @@ class MaskWatch(Part):
             self.check(at.last)
 
     def add(self, view: Camera, mask: Tensor | None) -> None:
-        """Note the share of pixels that count in a view seen for the first time."""
+        """Note the share of pixels that count in a view, when the view is seen for the first time."""
         if view.uid not in self._left:
             return
         self._left.remove(view.uid)
@@ -142,7 +144,7 @@ class MaskWatch(Part):
             self._new.append((view.image_name, part.float().mean()))
 
     def check(self, last: bool) -> None:
-        """After all views were seen, or in the last iteration, name those with hardly any pixel that counts.
+        """Name the views with hardly any pixel that counts, after all views were seen or in the last iteration.
 
         UserError if no pixel counts in any view, or in any of the first hundred.
         """

@@ -57,7 +57,10 @@ Scores = dict[str, dict[str, float | None]]
 
 @dataclass(frozen=True)
 class Pair:
-    """Files of a render and its ground truth, with one size in pixels. masked: whether a mask tells what counts."""
+    """The files of a render and its ground truth, with their common size in pixels.
+
+    masked: true if a mask says which pixels count.
+    """
 
     name: str
     render: Path
@@ -116,7 +119,7 @@ def _pairs_of(method: Path) -> list[Pair]:
 
 
 def trained_with_eval(model: Path) -> bool | None:
-    """Whether the model was trained with a held-out test set; None if cfg_args does not say."""
+    """Tell whether the model was trained with a held-out test set; None if cfg_args does not say."""
     if not (model / "cfg_args").is_file():
         return None
     stored = read_cfg_args(model).get("eval")
@@ -167,7 +170,7 @@ def _dists_metric(network: torch.nn.Module, device: torch.device) -> Metric:
 def _tensors(
     render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, device: torch.device
 ) -> list[torch.Tensor]:
-    """Both images (1, 3, H, W) in [0, 1]; pixels of the render that do not count are the ground truth's."""
+    """Return both images (1, 3, H, W) in [0, 1]; pixels of the render that do not count are the ground truth's."""
     both = (render if mask is None else np.where(mask[..., None], render, truth), truth)
     return [torch.from_numpy(image.transpose(2, 0, 1)[None].copy()).to(device) / 255 for image in both]
 
@@ -226,7 +229,10 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
 
 
 def _unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> dict[str, float | None]:
-    """The PSNR of whole views in the right parts that the fitted ones show, by file name, of those that are scored."""
+    """Return the PSNR of whole views in the right halves that the fitted views show, by file name.
+
+    scored: file names of the views that are scored.
+    """
     found, widths = {}, {pair.name: pair.size[0] for pair in fitted if pair.name in scored}
     for pair in (pair for pair in whole if pair.name in widths):
         mask = mask_of(pair.truth.parents[1], pair.name)
@@ -237,7 +243,10 @@ def _unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> 
 
 
 def mean(values: dict[str, float | None]) -> float | None:
-    """Return the mean over the views that have a number, as all have, or none, but for infinite PSNRs; else None."""
+    """Return the mean over the views that have a number; None if none has one.
+
+    Either all views have a number or none has, except for infinite PSNRs.
+    """
     numbers = [value for value in values.values() if value is not None]
     return math.fsum(numbers) / len(numbers) if numbers else None
 
@@ -286,14 +295,14 @@ def evaluate(
 
 
 def depth_scores(method: Path) -> Scores:
-    """The errors of depth that render.py has written beside the renders of a method; none without a file."""
+    """Return the errors of depth that render.py has written beside the renders of a method; none without a file."""
     found = json_or_none(method / DEPTHS) or {}
     keys = dict.fromkeys(key for of_view in found.values() for key in of_view)
     return {key.upper(): {name: of_view[key] for name, of_view in found.items() if key in of_view} for key in keys}
 
 
 def keep_networks(model: Path, method: str, scores: Scores) -> list[str]:
-    """Add those of NETWORKS that model/per_view.json has of a method to new scores that lack them; return which.
+    """Add scores of NETWORKS in model/per_view.json to new scores of a method that lack them; return their names.
 
     None are added unless every view has the same PSNR and SSIM as then, which other pictures would change.
     """

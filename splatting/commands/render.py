@@ -67,10 +67,12 @@ def write_views(
     points: Mapping[str, PointDepths] | None = None,
     scored: ScoredViews | None = None,
 ) -> list[float]:
-    """Write renders, ground truth and masks of `views` under `folder`; seconds of rendering per view (without I/O).
+    """Write renders, ground truth and masks of `views` under `folder`. Return the seconds per view, without I/O.
 
-    train_test_exp: render with exposures, and write right halves only. planes: those of PLANES to write, too. points:
-    score the depth, by image name. scored: how to render and score them, None: by the options.
+    train_test_exp: render with exposures, and write right halves only.
+    planes: those of PLANES to write, too.
+    points: score the depth at these points, by image name.
+    scored: renderer and scorer of the views; None: by the options.
     """
     scored = scored or ScoredViews(pipe, background, train_test_exp)
     for side in ("renders", "gt"):
@@ -130,10 +132,11 @@ def render_set(
     points: Mapping[str, PointDepths] | None = None,
     scored: ScoredViews | None = None,
 ) -> None:
-    """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; say how long.
+    """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; print the time.
 
-    train_test_exp: render with exposures, and write right halves only. separate_sh: accepted for callers of the
-    reference; the SH bands are always passed separately. planes, points, scored: as for `write_views`.
+    train_test_exp: render with exposures, and write right halves only.
+    separate_sh: accepted for callers of the reference; the SH bands are always passed separately.
+    planes, points, scored: as for `write_views`.
     """
     folder = Path(model_path) / name / f"ours_{iteration}"
     for of_earlier in (TIMES, DEPTHS):  # of an interrupted run they do not count
@@ -165,12 +168,16 @@ def render_sets(
     planes: Collection[str] = (),
     ply: str = "",
 ) -> None:
-    """Render the views of a saved iteration, -1: the last one, by `render_set`.
+    """Render the views of a saved iteration by `render_set`; -1: the last one.
 
-    Folders of pictures that options draw or compare in another way than the model's have names that say so, as in
-    ours_30000_r2. Test views are also rendered as parts score them besides, as ours_N_fitted_appearance.
-    dataset: the model options. sh_degree: degree that the PLY must have, None: any. planes: those of PLANES to write,
-    too. ply: model of any tool to render instead, into folders that have its name. UserError if nothing can be loaded.
+    Folders of pictures that options draw or compare otherwise than the model's have names that say so, as in
+    ours_30000_r2. Test views are also rendered as parts score them in addition, as ours_N_fitted_appearance. UserError
+    if nothing can be loaded.
+
+    dataset: the model options.
+    sh_degree: degree that the PLY must have, None: any.
+    planes: those of PLANES to write, too.
+    ply: model of any tool to render instead, into folders that have its name.
     """
     scene, background = _loaded(dataset, iteration, sh_degree, ply, pipeline)
     drawn = scene.gaussians, pipeline, background, scene.halves, separate_sh
@@ -201,9 +208,9 @@ def _loaded(
     pipeline: argparse.Namespace,
     load: Callable[..., Scene | WithoutScene] = load_saved,
 ) -> tuple[Scene | WithoutScene, torch.Tensor]:
-    """The scene with the model of a saved iteration, or that of the file `ply`, and the background (3,).
+    """Return the scene with the model of a saved iteration, or with that of the file `ply`, and the background (3,).
 
-    load: loads a saved iteration; `saved_scene` also without the scene.
+    load: function that loads a saved iteration; `saved_scene` also loads it without the scene.
     """
     options = copy.copy(dataset)
     options.images_to_load = 1  # each photo is used once
@@ -223,7 +230,7 @@ def _loaded(
 
 
 def _small(path: Path) -> np.ndarray:
-    """Read a picture at _SMALL, as (h, w, 3) float64 of 255."""
+    """Read a picture at _SMALL: (h, w, 3) float64, 0 to 255."""
     with open_image(path) as image:
         return np.asarray(image.convert("RGB").resize(_SMALL), float)
 

@@ -62,7 +62,7 @@ def training(
     debug_from: int = -1,
     **launch: Any,
 ) -> None:
-    """`train`, with the parameters of the reference's function of this name.
+    """Call `train`, with the parameters of the reference's function of this name.
 
     launch: other options of the launch. Without any, a remote viewer is served only if network_gui listens.
     """

@@ -1,4 +1,4 @@
-"""Faster forms of the plain step: all give the same bytes."""
+"""Faster forms of the plain step. All give the same bytes."""
 
 from splatting.faster.captured import CapturedStep
 from splatting.faster.faster import FasterSteps
@@ -7,9 +7,9 @@ from splatting.run import Run
 
 
 def faster_steps(run: Run) -> FasterSteps:
-    """The fastest way to take the steps of this run.
+    """Return the fastest steps for this run.
 
-    None is taken faster than plainly where somebody else may need gradients.
+    Where somebody else may need gradients, all steps are plain.
     """
     if not FusedStep.suits(run):
         return FasterSteps()

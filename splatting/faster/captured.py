@@ -1,8 +1,8 @@
 """The captured step: a fused step that is one launch, taken by a host that runs ahead of its GPU.
 
-A step has some fifty launches, which cost the host more than the GPU computes for, and the GPU a gap each. So most are
-graphs (training/steps/graphs.py). All else is the code of training/steps/fused.py, and the kernels are the same, so the
-bytes are those of any other way to take the step.
+A step has some fifty launches. Each costs the host more than the GPU computes for it, and leaves the GPU idle for a
+moment. So most steps are replayed as graphs (splatting/faster/graphs.py). All else is the code of
+splatting/faster/fused.py, and the kernels are the same, so the bytes are those of any other way to take the step.
 """
 
 from contextlib import nullcontext
@@ -80,7 +80,7 @@ class CapturedStep(FusedStep):
         return knows
 
     def _queue(self, at: Iteration) -> Losses | None:
-        """Queue a step. Returns its losses, or None if these have further terms."""
+        """Queue a step. Return its losses, or None if the loss depends on a parameter otherwise than by the image."""
         run, strategy = self._run, self._run.strategy
         losses = self._graphs.launch(at)
         if losses is not None:
@@ -102,7 +102,7 @@ class CapturedStep(FusedStep):
         return losses
 
     def _fetch(self, at: Iteration) -> None:
-        """Queue a copy to the host of the gradient of the view's camera."""
+        """Queue a copy of the gradient of the view's camera to the host."""
         if self._rows is None:
             return
         row = self._rows[at.iteration % ROWS]
@@ -111,9 +111,9 @@ class CapturedStep(FusedStep):
         self._fetched[at.iteration] = _Fetched(at.camera.uid, row, copied)
 
     def _step_on_host(self, most: int) -> None:
-        """Take the steps of cameras that steps of the Gaussians left behind, but at most so many of the last.
+        """Take pending steps of cameras, until at most `most` are left.
 
-        They wait as long as they may: to wait for a step's end here would let the GPU run out of work.
+        Steps of cameras wait as long as they may: to wait here for the end of a step would let the GPU run out of work.
         """
         while len(self._fetched) > most:
             iteration = next(iter(self._fetched))
@@ -126,7 +126,7 @@ class CapturedStep(FusedStep):
     # What speculation asks for, of steps that are done or overflowed
 
     def replay(self, at: Iteration, first: Losses) -> None:
-        """Queue a step once more, with the same values, which go into the losses that observers hold (`first`)."""
+        """Queue a step once more, and copy its losses, which are the same, into those that observers hold (`first`)."""
         self._run.set_rates(at)
         losses = self._queue(at)
         with torch.no_grad():
@@ -137,7 +137,7 @@ class CapturedStep(FusedStep):
                 old.detach().copy_(new)
 
     def rewind(self, steps: int) -> None:
-        """Take back what the host has counted for steps that will be replayed."""
+        """Take back the counts of the host for steps that will be replayed."""
         self._run.gaussians.rewind(steps)
         if steps and self._run.sleeping:
             self._run.sleeping.stepped()  # a rest may be among the steps

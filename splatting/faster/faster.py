@@ -1,4 +1,4 @@
-"""What a faster form of the plain step (splatting/loop.py) is asked for: the same bytes, sooner."""
+"""Interface of the faster forms of the plain step (splatting/loop.py): the same bytes, sooner."""
 
 from typing import Protocol
 
@@ -6,7 +6,7 @@ from splatting.iteration import Iteration, Losses
 
 
 class Tell(Protocol):
-    """What a step tells observers."""
+    """Receiver of the losses of a step, for observers."""
 
     def measured(self, at: Iteration, losses: Losses) -> None: ...
 
@@ -15,7 +15,7 @@ class FasterSteps:
     """Takes steps faster than `plain_step`, with the same bytes. This base takes none, and leaves nothing pending."""
 
     def take(self, at: Iteration, tell: Tell) -> bool:
-        """Take a step, and tell observers once its loss is known. False: it is one that `plain_step` must take."""
+        """Take a step, and tell observers when its loss is known. Return False for one that `plain_step` must take."""
         return False
 
     def throttle(self, at: Iteration) -> None:

@@ -14,9 +14,10 @@ Measured = tuple[Drawn, Losses, Gradients]
 
 
 class FusedStep(FasterSteps):
-    """Fused backward and optimiser, byte-equal to the plain step, which is taken if anything else reads gradients.
+    """Fuses backward and optimiser, byte-equal to the plain step, which is taken if anything else reads gradients.
 
-    Autograd differentiates the loss by the image alone, so any loss of image and depth will do, and exposures.
+    Autograd differentiates the loss by the image alone. So the loss may be any function of image and depth, and of
+    exposures.
     """
 
     def __init__(self, run: Run) -> None:
@@ -30,7 +31,7 @@ class FusedStep(FasterSteps):
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether nobody else needs gradients. Foreign objectives and strategy controls may, and some options do."""
+        """Tell whether nobody else needs gradients, as objectives and strategies of others may, and some options do."""
         return run.is_standard and not (run.launch.plain_step or torch.is_anomaly_enabled())
 
     def take(self, at: Iteration, tell: Tell) -> bool:
@@ -48,7 +49,7 @@ class FusedStep(FasterSteps):
         return True
 
     def _fuses(self, at: Iteration) -> bool:
-        """Whether the step of this iteration can be fused."""
+        """Tell whether the step of this iteration can be fused."""
         if self._run.pipe.debug or self._has_parameter_terms:
             self._is_known = False
             return False
@@ -63,7 +64,10 @@ class FusedStep(FasterSteps):
         return FusedAdam.takes(self._run.gaussians)
 
     def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
-        """Render: what was drawn, the losses, and their gradients of image and depth. now: as for `Drawn.step`."""
+        """Render a view. Return what was drawn, the losses, and the losses' gradients by image and depth.
+
+        now: as for `Drawn.step`.
+        """
         run = self._run
         if run.camera_steps and now is None:
             run.camera_steps.place(at.camera)
@@ -87,10 +91,11 @@ class FusedStep(FasterSteps):
         return drawn, losses.detached(), (image.grad, None if depth is None else depth.grad)
 
     def drops_parameter_terms(self) -> bool:
-        """Whether the loss of the last `measure` depends on a parameter by another way than the image.
+        """Tell whether the loss of the last `measure` depends on a parameter otherwise than by the image.
 
-        Somebody has added a term to it. Its gradients are dropped, and from now on all steps are plain. Blocks go on
-        sleeping until a plain step finds that the term reaches them: a rest would be lost here if a step has halted.
+        This is so if somebody has added a term to the loss. The gradients of that term are dropped, and from now on all
+        steps are plain. Blocks go on sleeping until a plain step finds that the term reaches them: to wake them here
+        would lose a rest if a step has halted.
         """
         gaussians = self._run.gaussians
         params = [gaussians.raw(name) for name in gaussians._attributes]
@@ -100,7 +105,7 @@ class FusedStep(FasterSteps):
         return self._has_parameter_terms
 
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:
-        """Take the step of the Gaussians, as far as they take one, and add the view to the statistics."""
+        """Take the step of the Gaussians, unless they take none, and add the view to the statistics."""
         gaussians, strategy = self._run.gaussians, self._run.strategy
         adam, steps, observes = self._adam, at.steps, strategy.observes(at.iteration)
         if not at.steps or at.changes:
@@ -111,7 +116,7 @@ class FusedStep(FasterSteps):
             drawn.step(adam, *gradients, observes, strategy.absolute_gradients, camera=self.camera_gradient)
 
     def follow(self, at: Iteration) -> None:
-        """Change rows, where it is time to, and take the step of the exposures."""
+        """Change rows, where that is due, and take the step of the exposures."""
         run = self._run
         if at.changes:
             run.strategy.change_rows(at)

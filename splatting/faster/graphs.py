@@ -1,8 +1,9 @@
-"""Fused steps as graphs: most differ only in numbers, which a graph reads from fixed places in the GPU's memory.
+"""Graphs of fused steps: most steps differ only in numbers, which a graph reads from fixed places in the GPU's memory.
 
-These are the camera, the photo, Adam's constants and the iteration. The host fills them by a copy. A graph is good for
-one kind of step (size and angle of the image, SH degree, statistics or not) until the Gaussians' tensors are replaced,
-as strategy control does, or their lists outgrow its capacity (training/steps/speculative.py).
+The numbers are the camera, the photo, Adam's constants and the iteration. The host fills them in by a copy. A graph
+serves one kind of step (size and angle of the image, SH degree, with or without statistics). It lasts until the tensors
+of the Gaussians are replaced, as density control does, or until the lists of a step outgrow the graph's capacity
+(splatting/faster/speculative.py).
 """
 
 from collections.abc import Callable, Hashable
@@ -38,7 +39,10 @@ class _Graph:
 
 
 class Graphs:
-    """Takes fused steps by one launch, where it can. capacity: that of any view (`Speculation.capacity`)."""
+    """Takes fused steps by one launch, where that is possible.
+
+    capacity: `Speculation.capacity`; the graphs use that of any view.
+    """
 
     def __init__(
         self, run: Run, fused: FusedStep, adam: FusedAdam, capacity: Callable[[None], AbstractContextManager]
@@ -58,7 +62,7 @@ class Graphs:
         self._taken = 0
 
     def launch(self, at: Iteration) -> Losses | None:
-        """Take a step of the run, or do nothing and return None where it has to be taken in another way."""
+        """Take a step of the run. Return None, having done nothing, where the step has to be taken in another way."""
         graph = self._graph_for(at) if self._is_usual(at) else None
         if graph is None:
             return None
@@ -87,11 +91,11 @@ class Graphs:
         return Losses(total, l1, {}, None)
 
     def clear(self) -> None:
-        """Forget the graphs: their capacity was too small."""
+        """Forget the graphs, whose capacity was too small."""
         self._graphs.clear()
 
     def check(self) -> None:
-        """Forget the graphs if something that they took for fixed has changed."""
+        """Forget the graphs if something has changed that they took for fixed."""
         run, optimizer = self._run, self._run.gaussians.optimizer
         columns = optimizer.active_columns("f_rest")
         used = run.objective, run.strategy, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns
@@ -102,7 +106,7 @@ class Graphs:
             self._baked = baked
 
     def save_memory(self) -> None:
-        """Give memory back, if most of it is taken, before something else asks for it."""
+        """Give memory back, if most of it is taken, before something else asks for memory."""
         if self._graphs and self._recorder.is_tight():
             self._release()
 
@@ -111,11 +115,14 @@ class Graphs:
         self._recorder.release()
 
     def _is_usual(self, at: Iteration) -> bool:
-        """Whether the photo has no mask, and what parts add to the loss can be captured."""
+        """Tell whether the photo has no mask, and the terms of parts can be captured."""
         return self._able and at.captured and at.camera.counts_all_pixels
 
     def _graph_for(self, at: Iteration) -> _Graph | None:
-        """The graph for a step, made if it is worth it. The first step of a kind is not, as it may load kernels."""
+        """Return the graph for a step, captured if that is worth it; None without a graph.
+
+        The first step of a kind is not captured, as it may load kernels.
+        """
         camera, run = at.camera, self._run
         held = run.gaussians.exposures.applied and run.gaussians.exposures.held
         phase = run.strategy.observes(at.iteration), run.gaussians.active_sh_degree, held
@@ -135,7 +142,7 @@ class Graphs:
         return graph
 
     def _captured(self, at: Iteration) -> _Graph | None:
-        """Capture a step. None, for good, where memory or the objective does not allow it."""
+        """Capture a step. Return None, for good, where memory or the objective does not allow it."""
         try:
             try:
                 return self._capture(at)
@@ -200,7 +207,7 @@ class Graphs:
         return torch.stack([losses.total, losses.l1])
 
     def _numbers_of(self, camera: Camera) -> np.ndarray:
-        """The camera's numbers (35,) on the host, read from the GPU once; those of a trained pose never lie there."""
+        """Return the camera's numbers (35,) on the host: read from the GPU once, or those of a trained pose."""
         if host := self._run.camera_steps:
             host.place(camera)
             return camera.numbers[:_CAMERA]

@@ -1,4 +1,4 @@
-"""Capture of what a function queues on a GPU as a CUDA graph, with what torch needs for it."""
+"""The recorder: captures the launches of a function as a CUDA graph, with what torch needs for that."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -9,16 +9,17 @@ from torch import Tensor
 
 
 class Recorder:
-    """Captures on a stream of its own, on which nothing ever runs. All graphs share one pool of memory."""
+    """Captures graphs on a stream of its own, on which nothing ever runs. All graphs share one pool of memory."""
 
     def __init__(self, device: torch.device) -> None:
         self._device, self._stream = device, torch.cuda.Stream(device)
         self._keeper: torch.cuda.CUDAGraph | None = None
 
     def capture(self, body: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
-        """Capture what a function queues: a function that queues it, and the result, which each launch overwrites.
+        """Capture the launches of a function. Return a function that launches them again, and the result of `body`.
 
-        RuntimeError, torch.OutOfMemoryError among them, if it cannot be captured.
+        Each launch overwrites the result. RuntimeError, torch.OutOfMemoryError among them, if the function cannot be
+        captured.
         """
         if self._keeper is None:
             self._pool, self._word = torch.cuda.graph_pool_handle(), torch.zeros(1, device=self._device)
@@ -28,12 +29,12 @@ class Recorder:
         return graph.replay, result
 
     def release(self) -> None:
-        """Give back the memory of graphs that nobody has any more, and what torch keeps for later."""
+        """Give back the memory of graphs that nobody uses any more, and the memory that torch keeps for later."""
         self._keeper = None
         torch.cuda.empty_cache()
 
     def is_tight(self) -> bool:
-        """Whether most of what torch may take is taken, so that what is kept for later should be given back."""
+        """Tell whether torch has taken most of what it may take, and should give back what it keeps for later."""
         free, total = torch.cuda.mem_get_info(self._device)
         most = torch.cuda.get_per_process_memory_fraction() * total
         return min(free, most - torch.cuda.memory_reserved(self._device)) < most / 4
@@ -56,7 +57,7 @@ class Recorder:
         return graph, result
 
     def _end(self, graph: torch.cuda.CUDAGraph) -> None:
-        """End a capture that has failed, so that torch's allocator and generator take part in it no longer."""
+        """End a capture that has failed, so that torch's allocator and generator leave it."""
         index = torch.cuda.current_device()
         try:
             graph.capture_end()
@@ -72,7 +73,7 @@ class Recorder:
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Within it Python collects no garbage: to destroy the graph of an earlier training would invalidate a capture."""
+    """Turn Python's garbage collection off: to destroy the graph of an earlier training would invalidate a capture."""
     enabled = gc.isenabled()
     gc.disable()
     try:

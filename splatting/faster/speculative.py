@@ -1,17 +1,18 @@
 """Speculative list capacities: a host that runs ahead of its GPU replays the steps that overflow.
 
-A step needs memory for lists whose lengths only the GPU knows. To wait for them in every step would leave the GPU idle
-while the host prepares the next launches. So the host guesses from what the view needed before, and does not wait. A
-kernel that finds too little capacity halts: neither it nor any later kernel changes anything (gs::Queue::halted in
-submodules/common/include/gs/cuda_queue.h). Some steps later the host reads that in a report which the GPU writes into
-the host's memory. It then raises the capacity, and replays the steps from the halted one on, in their order. So no
-value depends on the guesses, only the time does. The GPU counts the steps itself, so that a step can be captured.
+A step needs memory for lists whose lengths only the GPU knows. To wait for the lengths in every step would leave the
+GPU idle while the host prepares the next launches. So the host guesses from what the view needed before, and does not
+wait. A kernel that finds too little capacity halts: neither it nor any later kernel changes anything (gs::Queue::halted
+in submodules/common/include/gs/cuda_queue.h). Some steps later the host reads of the halt in a report that the GPU
+writes into the host's memory. It then raises the capacity, and replays the steps from the halted one on, in their
+order. So no value depends on the guesses, only the time does. The GPU counts the steps itself, so that a step can be
+captured.
 
-Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that
-the CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
-(scene/images/store.py). A step is captured on a third stream, on which nothing ever runs; its launch is
-queued on the current stream like any other. The reports go straight into page-locked memory. The host reads them
-without a call to the GPU, and waits for the whole stream before it replays steps or lets anybody read the model.
+Streams: everything that a step computes is queued on torch's current stream, in the order of the calls. Photos that the
+    CPU keeps are copied on a stream of their own, and the current stream waits for the event of the one it needs
+    (scene/images/store.py). A step is captured on a third stream, on which nothing ever runs; its launch is queued on
+    the current stream like any other. The reports go straight into page-locked memory. The host reads them without a
+    call to the GPU, and waits for the whole stream before it replays steps or lets anybody read the model.
 """
 
 import time
@@ -30,16 +31,16 @@ AHEAD = 8  # steps; enough to hide a pause of the host, and few to replay
 
 
 class Replayed(Protocol):
-    """What speculation asks of the taker of the steps (splatting/faster/captured.py)."""
+    """Interface by which speculation replays the steps of their owner (splatting/faster/captured.py)."""
 
     def measure(self, at: Iteration) -> object:
         """Render a view, and compute the losses and their gradients."""
 
     def replay(self, at: Iteration, first: Losses) -> None:
-        """Take a step once more; its losses go into `first`."""
+        """Take a step once more, and copy its losses into `first`."""
 
     def rewind(self, steps: int) -> None:
-        """Take back what the host has counted for so many steps."""
+        """Take back the counts of the host for so many steps."""
 
 
 _REPORTS = 2 * AHEAD
@@ -60,7 +61,10 @@ class _Pending:
 
 
 class Speculation:
-    """The steps that a GPU has yet to do. steps: queues and replays them."""
+    """The steps that a GPU has yet to do.
+
+    steps: owner of the steps, which queues and replays them.
+    """
 
     def __init__(self, device: torch.device, steps: "Replayed") -> None:
         self._words = torch.zeros(6, dtype=torch.int64, device=device)
@@ -77,7 +81,7 @@ class Speculation:
         self._pending.append(_Pending(at, losses))
 
     def discard(self) -> None:
-        """Forget what was queued of a step that is taken in another way, once all steps before it are done."""
+        """Forget the launches of a step that is taken in another way, once all steps before it are done."""
         self._collect(0)
         self._stream.synchronize()
         self._words[0] = 0  # what was queued in vain may have overflowed
@@ -101,7 +105,7 @@ class Speculation:
 
     @contextmanager
     def capacity(self, at: Iteration | None) -> Iterator[None]:
-        """Within it, operators take what the view of an iteration needed before, or with None what any view needed."""
+        """Give operators the capacity that an iteration's view needed before, or with None the largest of any view."""
         OPERATORS.run_ahead_(self._words, self._capacity_of(at and _view(at)), self._reports)
         try:
             yield
@@ -109,7 +113,7 @@ class Speculation:
             OPERATORS.run_ahead_(None, [], None)
 
     def _capacity_of(self, view: Hashable | None) -> Capacity:
-        """What a view needed before, and some spare; a new view gets that of the largest."""
+        """Return the capacity that a view needed before, with some spare; a new view gets that of the largest."""
         if not self._needed:
             return _FIRST
         *lists, blocks = self._needed_by(view)
@@ -120,19 +124,19 @@ class Speculation:
         return self._needed.get(view) or tuple(map(max, zip((0, 0, 0, 0), *self._needed.values(), strict=True)))
 
     def _report(self) -> list[int] | None:
-        """Of the first pending step: what it needs, then halted; None until the GPU has written them."""
+        """Return the report of the first pending step: its needs, then halted; None until the GPU has written it."""
         number = self._done + 1
         numbers = self._numbers[number % _REPORTS]
         return numbers[:5].tolist() if numbers[5] == number else None
 
     def _finish(self, report: list[int]) -> None:
-        """Strike the first pending step off."""
+        """Take the first pending step off the list, and note its needs."""
         at = self._pending.popleft().at
         self._needed[_view(at)] = tuple(report[:4])
         self._done += 1
 
     def _collect(self, most: int) -> None:
-        """Take back the reports that are there, and wait until at most so many steps are pending."""
+        """Read the reports that are there, and wait until at most so many steps are pending."""
         while self._pending:
             report = self._report()
             if report is None:
@@ -145,7 +149,7 @@ class Speculation:
                 self._finish(report)
 
     def _replay(self, report: list[int]) -> None:
-        """Raise the capacity of the step that was halted, and replay it and all later ones."""
+        """Raise the capacity of the step that was halted, and replay this step and all later ones."""
         self._stream.synchronize()
         self._words[0] = 0
         self._numbers[(self._done + 1) % _REPORTS][5] = 0  # the halted step's report will come once more
@@ -163,12 +167,12 @@ class Speculation:
 
 
 def _with_spare(count: int, least: int = _LEAST) -> int:
-    """A little more, in few different sizes, so that torch's allocator finds them again."""
+    """Return a little more than a count, in few different sizes, so that torch's allocator finds them again."""
     requested = max(int(_SPARE * count), least)
     unit = 1 << max(requested.bit_length() - 4, 0)
     return -(-requested // unit) * unit
 
 
 def _view(at: Iteration) -> Hashable:
-    """What the capacity that a step needs depends on."""
+    """Return the key of the view on which the capacity of a step depends."""
     return at.camera.uid, at.camera.image_width

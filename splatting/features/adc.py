@@ -15,10 +15,10 @@ from splatting.part import Strategy
 
 
 class Adc(Strategy):
-    """Adaptive density control, with the rules of scene/gaussians/density_rules.py. Those like it override `densify`.
+    """Adaptive density control, by the rules of scene/gaussians/density_rules.py. Similar ones override `densify`.
 
-    threshold: of a Gaussian's mean screen-space gradient, per NDC unit, from which on it is cloned or split; with
-    absolute_gradients, of its pixels' absolute gradients (Ye et al. 2024, AbsGS).
+    threshold: mean screen-space gradient of a Gaussian, per NDC unit, from which on the Gaussian is cloned or split.
+        With absolute_gradients, the gradient is made of its pixels' absolute gradients (Ye et al. 2024, AbsGS).
     """
 
     name = "adc"
@@ -30,7 +30,10 @@ class Adc(Strategy):
         return opt.absgrad
 
     def begin(self, run: Any, state: Any) -> None:
-        """Where a part allows no resets, opacities are reset at an interval that is given, or never."""
+        """Take the rules and their numbers from the options.
+
+        Where a part allows no resets, opacities are reset only at an interval that a user gives.
+        """
         super().begin(run, state)
         opt, self._white_background = run.opt, run.dataset.white_background
         usual = opt.opacity_reset_interval == density_rules.USUAL_RESETS
@@ -80,7 +83,10 @@ class Adc(Strategy):
             self._gaussians.reset_opacity()
 
     def _ends_too_soon(self, step: int, iteration: int) -> bool:
-        """Whether a run by the clock, at the pace of an iteration, could not recover from a reset at a step."""
+        """Tell whether a run by the clock is too short to recover from a reset at a step.
+
+        The pace is that of an iteration.
+        """
         schedule = self.schedule
         left = (schedule.length - step) / schedule.stride(iteration)
         return schedule.paced and left < self._rules.RECOVERY
@@ -90,7 +96,10 @@ class Adc(Strategy):
         return self._rules.actions(iteration, self._opt, self._white_background, *place)
 
     def densify(self, iteration: int, limit_size: bool) -> None:
-        """Clone, split and prune by the statistics, which start anew. limit_size: prune what is large on screen."""
+        """Clone, split and prune by the statistics, which then start anew.
+
+        limit_size: true to prune what is large on screen.
+        """
         gaussians, most = self._gaussians, self.max_gaussians
         gaussians.densify_and_prune(
             self.threshold,

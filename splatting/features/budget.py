@@ -1,11 +1,14 @@
-"""Growth to a given number of Gaussians, where the training views' error is.
+"""The strategy budget: growth to a given number of Gaussians, where the training views have errors.
 
-After the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and the
-long-axis split of Deng et al. 2025 (Improved-GS). Of these papers it departs as follows. The curve is even, which was
-no worse on small scenes and trains fewer Gaussians. Scores are sums of a pixel error times blending weight over several
-views, and nothing else counts. Gaussians are drawn by their scores without replacement, not the highest taken. Children
-keep their parent's mean and covariance. Opacities are multiplied by a factor, where Rota Bulo et al. subtract a
-constant. Adam averages squared gradients over fewer iterations, and SH bands learn faster from many photos.
+Based on the growth curve of Mallick et al. 2024 (Taming 3DGS), the error-driven scores of Rota Bulo et al. 2024, and
+the long-axis split of Deng et al. 2025 (Improved-GS). Differences from these papers:
+
+- The growth curve is even, which was no worse on small scenes and trains fewer Gaussians.
+- Scores are sums of a pixel error times blending weight over several views, and nothing else counts.
+- Gaussians are drawn by their scores without replacement; the highest scores are not simply taken.
+- Children keep their parent's mean and covariance.
+- Opacities are multiplied by a factor, where Rota Bulo et al. subtract a constant.
+- Adam averages squared gradients over fewer iterations, and SH bands learn faster from many photos.
 """
 
 import math
@@ -33,7 +36,7 @@ ITERATIONS_A_SCORE = 5  # at least, of a scored view
 class Budget(Strategy):
     """Removes useless Gaussians and adds others, every densification_interval steps before densify_until_iter.
 
-    max_gaussians is their number at the end of that. In a given time it is best in most cases.
+    The number of Gaussians at the end of that is max_gaussians. In a given time, this strategy is best in most cases.
     """
 
     name = "budget"
@@ -54,11 +57,11 @@ class Budget(Strategy):
         self.band_rate = band_rate(self._cameras)
 
     def rate_factor(self, iteration: int) -> float:
-        """Learning rates follow the number of iterations, and fall at the end."""
+        """Return a factor that follows the number of iterations, and falls at the end."""
         return longer_steps(self.schedule.usual_stride(iteration), iteration / self.schedule.length)
 
     def beta2(self, iteration: int) -> float:
-        """Fewer iterations average over fewer of them, by the root of their number as their steps are longer."""
+        """Return a decay that averages over fewer steps in a run of fewer and longer ones, by their number's root."""
         return 1.0 - min(SQUARES * math.sqrt(self.schedule.usual_stride(iteration)), 1 / LEAST_AVERAGED)
 
     def changes(self, iteration: int) -> bool:
@@ -87,9 +90,11 @@ class Budget(Strategy):
         return count
 
     def _aim(self, now: int, iteration: int) -> int:
-        """How many Gaussians there are to be after the densification of an iteration, `now` before it.
+        """Return the number of Gaussians to have after the densification of an iteration.
 
-        They approach the most in equal parts. This needs no state, and a run that fell behind catches up.
+        The number approaches the most in equal parts. This needs no state, and a run that fell behind catches up.
+
+        now: number before the densification.
         """
         most = self.schedule.count_limit(iteration, now, self.max_gaussians, self.max_gaussians)
         remaining = self._remaining(iteration)
@@ -99,7 +104,7 @@ class Budget(Strategy):
         return self.schedule.schedule_step(iteration) > self._opt.densify_from_iter
 
     def _remaining(self, iteration: int) -> int:
-        """How many densifications follow that of this iteration, at its schedule."""
+        """Return the number of densifications after that of this iteration, at the iteration's stride."""
         opt, stride = self._opt, self.schedule.stride(iteration)
         ahead = (opt.densify_until_iter - self.schedule.schedule_step(iteration)) / (self._interval(iteration) * stride)
         if stride != 1:
@@ -110,7 +115,7 @@ class Budget(Strategy):
         return interval(self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration))
 
     def _chosen(self, at: Iteration, count: int) -> Tensor:
-        """Indices of this process's Gaussians to split, ascending; those of all processes are at most `count`."""
+        """Return the indices of this process's Gaussians to split, ascending; `count` at most over all processes."""
         scores = self._scores(self._scored_views(at.iteration), at.background)
         numbers = {"seed": self._opt.seed, "stream": Stream.DENSIFY, "iteration": at.iteration}
         return self._gaussians.shards.choose(scores, count, **numbers)

@@ -1,6 +1,6 @@
-"""What the strategy budget does to rows: split in two, fade; and where: scores of Gaussians by the error of views.
+"""Rules of the strategy budget: split rows in two, fade opacities, and score Gaussians by the error of views.
 
-A score is how much of the error of training views a Gaussian draws (Rota Bulo et al. 2024).
+A score is the share of a Gaussian in the error of training views (Rota Bulo et al. 2024).
 """
 
 import argparse
@@ -23,10 +23,12 @@ from scene.gaussians.parameters import GaussianParameters
 @torch.no_grad()
 @changes_rows
 def split_in_two(gaussians: GaussianParameters, parents: Tensor) -> None:
-    """Split Gaussians, ascending indices (n,), along their longest axis (scene/gaussians/long_axis.py).
+    """Split Gaussians along their longest axis (scene/gaussians/long_axis.py).
 
-    One child takes its parent's row, the other is appended. Adam's averages of both begin at zero, so that their first
-    steps are long: with the parent's averages they would stay almost where they are.
+    One child takes its parent's row, the other is appended. Adam's averages of both begin at zero, which makes the
+    first steps long: with the parent's averages, the children would stay almost where they are.
+
+    parents: indices (n,), ascending.
     """
     count = len(parents)
     if not gaussians.shards.ranks.any_rank(count > 0):
@@ -55,7 +57,7 @@ def fade(gaussians: GaussianParameters, factor: float) -> None:
 
 
 def faded(logits: Tensor, factor: float) -> Tensor:
-    """Logits (N, 1) of opacities multiplied by a factor in (0, 1): same bits on every device.
+    """Return the logits (N, 1) of opacities multiplied by a factor in (0, 1): same bits on every device.
 
     With a = 1 / (1 + e), e = exp(-logit), factor a / (1 - factor a) is factor / (e + 1 - factor).
     """
@@ -64,10 +66,12 @@ def faded(logits: Tensor, factor: float) -> Tensor:
 
 
 def error_map(image: Tensor, target: Tensor, mask: Tensor | None = None, columns: slice | None = None) -> Tensor:
-    """Mean absolute differences of the channels (1, H, W), which are 0 where a pixel does not count.
+    """Return the mean absolute difference of the channels (1, H, W), 0 where a pixel does not count.
 
-    image (3, H, W) float32, not clamped; target, mask and columns as for `photometric_loss`. Each is divided by the
-    number of pixels that count, as in the mean of that loss.
+    Each value is divided by the number of pixels that count, as in the mean of the photometric loss.
+
+    image: (3, H, W) float32, not clamped.
+    target, mask, columns: as for `photometric_loss`.
     """
     if target.dtype == torch.uint8:
         target = target.float() / 255
@@ -84,7 +88,7 @@ def error_map(image: Tensor, target: Tensor, mask: Tensor | None = None, columns
 
 
 def _mean(errors: Tensor) -> Tensor:
-    """Mean of three channels (3, H, W), in one order of summation: (1, H, W)."""
+    """Return the mean of three channels (3, H, W), in one order of summation: (1, H, W)."""
     red, green, blue = errors
     return ((red + green + blue) / 3)[None]
 
@@ -92,10 +96,11 @@ def _mean(errors: Tensor) -> Tensor:
 def error_scores(
     gaussians: GaussianModel, pipe: argparse.Namespace, exposures: bool, cameras: Sequence[Camera], background: Tensor
 ) -> Tensor:
-    """Sum over the pixels of the error times each Gaussian's blending weight, over views: (N,) float64.
+    """Return the sum, over pixels and views, of the error times each Gaussian's blending weight: (N,) float64.
 
-    The error is L1 as the loss of training sees it: with exposure, mask, columns that count, and no clamp. exposures:
-    whether the photos' exposures are trained.
+    The error is L1 as the loss of training has it: with exposure, mask, columns that count, and no clamp.
+
+    exposures: true if the photos' exposures are trained.
     """
 
     def errors(image: Tensor, camera: Camera) -> Tensor:

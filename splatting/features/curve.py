@@ -14,7 +14,7 @@ from utils.system_utils import saved_iterations
 
 
 class Curve(Part):
-    """Scores test views, and as many training views, in planned iterations; draws the curve at the end."""
+    """Scores test views, and as many training views, in planned iterations, and draws the curve at the end."""
 
     name = "curve"
     _recorder: Any = None

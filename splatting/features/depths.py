@@ -19,7 +19,7 @@ from utils.loss_utils import inverse_depth_loss
 
 
 class Depths(Part):
-    """Finds the maps of the training photos, and adds their loss for views whose map is reliable."""
+    """Finds the depth maps of the training photos, and adds their loss for views whose map is reliable."""
 
     name = "depths"
     needs = Needs(depth=True, files=True)
@@ -49,8 +49,9 @@ class Depths(Part):
 
 
 def depth_loss(inverse_depth: Tensor, camera: Camera, mask: Tensor | None) -> Tensor:
-    """Mean |difference| of an inverse depth (1, H, W) from the camera's map, where the map has a value.
+    """Return the mean absolute difference of an inverse depth from the camera's map, where the map has a value.
 
+    inverse_depth: (1, H, W).
     mask: (1, H, W) bool, pixels that count; None: all.
     """
     target = camera.target_inverse_depth

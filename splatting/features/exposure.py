@@ -17,8 +17,8 @@ from utils.image_utils import half
 class Exposure(Appearance):
     """Trains the model's exposures by the half-image protocol.
 
-    Test photos train with their left half, too, and their right half is scored. So their exposures are known without
-    training on the pixels that are scored.
+    The left half of a test photo trains, too, and the right half is scored. So the exposure of the photo is known,
+    without training on the pixels that are scored.
     """
 
     name = "exposure"
@@ -51,7 +51,7 @@ class Exposure(Appearance):
 
 
 def train_on_all(info: SceneInfo) -> SceneInfo:
-    """The scene with its test views among the training views, too: sorted by name, or appended if names clash."""
+    """Return the scene with its test views added to the training views: sorted by name, or appended if names clash."""
     views = info.train_cameras + info.test_cameras
     if len({view.image_name for view in views}) == len(views):
         views.sort(key=lambda view: os.fsencode(view.image_name))

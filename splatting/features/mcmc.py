@@ -1,9 +1,12 @@
-"""Relocation and noise (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
+"""Strategy mcmc: relocation and noise (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-Gaussians are taken for samples of a distribution, and training for a random walk among them. What departs from the
-paper: opacities and scales are penalised by their means, as in the authors' release, where the paper writes sums;
-Adam's averages restart for the moved Gaussians as well as for those that they come to; a step and its penalties concern
-what the view sees; and SH bands learn faster from many photos.
+Gaussians are taken for samples of a distribution, and training for a random walk among them. Differences from the
+paper:
+
+- Opacities and scales are penalised by their means, as in the authors' release; the paper writes sums.
+- Adam's averages restart for the moved Gaussians, and also for those that they come to.
+- A step and its penalties concern what the view sees.
+- SH bands learn faster from many photos.
 """
 
 from collections.abc import Collection
@@ -23,9 +26,9 @@ SECONDS = 0.25  # for each training photo, at least: 250 iterations on a GPU (do
 
 
 class Mcmc(Strategy):
-    """Moves Gaussians that nobody sees to others, by the rules beside it. It resets no opacities.
+    """Moves Gaussians that nobody sees to others (splatting/features/mcmc_rules.py), and resets no opacities.
 
-    In a given time it is best for few photos, on a GPU.
+    In a given time, this strategy is best for few photos, on a GPU.
     """
 
     name = "mcmc"
@@ -61,7 +64,7 @@ class Mcmc(Strategy):
         return f"--mcmc_growth {self._opt.mcmc_growth:g} adds too few each time; raise it"
 
     def started(self) -> None:
-        """Make Gaussians more opaque and smaller than those of adaptive density control (as the authors' release)."""
+        """Make Gaussians more opaque and smaller than adaptive density control does, as in the authors' release."""
         scale = self._opt.mcmc_init_scale or INIT_SCALES[self.schedule.paced]
         start_as(self._gaussians, self._opt.mcmc_init_opacity, scale)
 
@@ -78,7 +81,7 @@ class Mcmc(Strategy):
         return count
 
     def skips_step(self, iteration: int) -> Collection[str]:
-        """All, unless there is nothing to do: then the Gaussians take their step."""
+        """Return all attributes, unless there is nothing to change; then the Gaussians take their step."""
         gaussians, least = self._gaussians, self._opt.mcmc_min_opacity
         if not self.changes(iteration):
             return ()
@@ -111,14 +114,14 @@ class Mcmc(Strategy):
         refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
 
     def _grow(self, iteration: int) -> None:
-        """Grow to `_grown`."""
+        """Add Gaussians until there are as many as `_grown` says."""
         count = self._gaussians.gaussian_count
         new = self._grown(count, iteration) - count
         if new > 0:
             grow(self._gaussians, new, seed=self._opt.seed, iteration=iteration)
 
     def _grown(self, count: int, iteration: int) -> int:
-        """The number after a growth: more by a part of it (the paper's rule of adding Gaussians), at least by one."""
+        """Return the number after a growth: more by a share (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
         most = self._limit(iteration, count, self.max_gaussians)
         return min(max(int((1 + growth) * count), count + (growth > 0)), most)

@@ -1,8 +1,8 @@
-"""Density control by relocation (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
+"""Rules of the strategy mcmc (Kheradmand et al. 2024, "3D Gaussian Splatting as Markov Chain Monte Carlo").
 
-Gaussians that nobody sees move to others, which are divided into equal parts that lie in the same place and together
-look as the one did. What decides rows is computed in
-float64 by operations that every device and number of threads rounds in the same way, and sums are of integers.
+Gaussians that nobody sees move to others. Such a target is divided into equal parts, which lie in the same place and
+together look as the target did. What decides rows is computed in float64, by operations that every device and number of
+threads rounds in the same way, and sums are of integers.
 """
 
 import math
@@ -28,7 +28,7 @@ _RELOCATION, _GROWTH = range(2)  # draws of one iteration
 
 
 def start_as(gaussians: GaussianParameters, opacity: float, scale: float) -> None:
-    """Give all Gaussians an opacity, and multiply their scales; call it before the first step."""
+    """Give all Gaussians an opacity, and multiply their scales. Call it before the first step."""
     with torch.no_grad():
         logits = torch.full_like(gaussians.raw("opacity"), logit(opacity))
         log_scales = gaussians.log_scales() + math.log(scale)
@@ -37,16 +37,18 @@ def start_as(gaussians: GaussianParameters, opacity: float, scale: float) -> Non
 
 
 def is_alive(gaussians: GaussianParameters, min_opacity: float) -> Tensor:
-    """Which Gaussians `relocate` leaves where they are, (N,) bool."""
+    """Return a mask of the Gaussians that `relocate` leaves where they are, (N,) bool."""
     return gaussians.opacity_logits().reshape(-1) > logit(min_opacity)
 
 
 def relocate(gaussians: GaussianParameters, min_opacity: float, *, seed: int, iteration: int) -> int:
-    """Move the Gaussians of an opacity <= min_opacity to others, which are drawn in proportion to their opacity.
+    """Move the Gaussians of an opacity <= min_opacity to others, drawn in proportion to the opacity of these.
 
-    A Gaussian and those that have come to it are equal parts of what it was, as far as these are at most MOST_PARTS.
-    Adam's averages of all of them restart at zero. seed and iteration decide the random numbers. Returns the number of
-    such Gaussians; if all are, nothing changes.
+    A target and the Gaussians that have come to it become equal parts of the former target, up to MOST_PARTS. Adam's
+    averages of all of them restart at zero. Return the number of Gaussians to move; if all would have to move, nothing
+    changes.
+
+    seed, iteration: decide the random numbers.
     """
     live = is_alive(gaussians, min_opacity)
     dead = (~live).nonzero().reshape(-1)
@@ -72,7 +74,9 @@ def grow(gaussians: GaussianParameters, count: int, *, seed: int, iteration: int
 def add_noise(gaussians: GaussianParameters, size: float, *, seed: int, iteration: int) -> None:
     """Move every centre by size g C n: its covariance C, standard normal n, the factor g of its opacity.
 
-    seed and iteration decide n. Nothing moves once a guard holds steps back.
+    Nothing moves once a guard holds steps back.
+
+    seed, iteration: decide n.
     """
     shapes = gaussians.log_scales(), gaussians.raw("rotation"), gaussians.opacity_logits()
     gate = {"size": size, "steepness": GATE_STEEPNESS, "threshold": GATE_OPACITY}
@@ -85,9 +89,9 @@ def add_noise(gaussians: GaussianParameters, size: float, *, seed: int, iteratio
 def _divide(
     gaussians: GaussianParameters, live: Tensor, count: int, seed: int, iteration: int, which: int
 ) -> tuple[Tensor, Tensor]:
-    """Draw the origins of `count` new Gaussians among those of `live`, and make each a part of what it was.
+    """Draw the origins of `count` new Gaussians among those of `live`, and make each origin a part of what it was.
 
-    Returns which draws (n,) fell on this rank's Gaussians, and the origins (n,).
+    Return the draws (n,) that fell on this rank's Gaussians, and their origins (n,).
     """
     logits = gaussians.opacity_logits().reshape(-1)
     units = torch.where(live, opacity_units(logits), 0)
@@ -101,17 +105,22 @@ def _divide(
 
 
 def opacity_units(logits: Tensor) -> Tensor:
-    """Opacities (N,) as whole numbers of 2^-24, at least 1, from logits (N,): int64."""
+    """Return opacities as whole numbers of 2^-24, at least 1: (N,) int64.
+
+    logits: (N,).
+    """
     return (_UNITS / (1.0 + exp(-logits.nan_to_num()))).to(torch.int64).clamp_min(1)
 
 
 def draw(
     units: Tensor, count: int, *, seed: int, iteration: int, draw: int, shards: Shards = WHOLE
 ) -> tuple[Tensor, Tensor]:
-    """`count` draws with replacement among all rows, in proportion to `units` (N,), whole numbers of a sum above 0.
+    """Draw `count` times with replacement among all rows, in proportion to `units`.
 
-    Returns which of the draws, (n,) ascending, fell on this process's items, and on which of them, (n,). seed,
-    iteration and draw decide the random numbers.
+    Return the draws that fell on this process's items, (n,) ascending, and the items drawn, (n,).
+
+    units: (N,) whole numbers, of a sum above 0.
+    seed, iteration, draw: decide the random numbers.
     """
     ends = units.cumsum(0)
     items = torch.arange(count, device=units.device)
@@ -128,12 +137,15 @@ def draw(
 
 
 def divided(logits: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:
-    """Opacity logits (n,) of each of `parts` equal parts of a Gaussian, and what is added to its log scales (n,).
+    """Return the opacity logits (n,) of equal parts of Gaussians, and the changes of their log scales (n,).
 
-    logits: (n,) of the Gaussians before; parts: (n,) int64 from 1 to MOST_PARTS. Returns float64. With N parts, the
-    opacity o becomes p = 1 - (1 - o)^(1/N), and scales are multiplied by o / sum_{k=1..N} C(N, k) (-1)^(k+1) p^k /
-    sqrt(k) (the paper's rule of relocation; its double sum, with the inner binomials added up). So in the
-    middle the parts together are as opaque as the one was, and along any line through it they hide as much in total.
+    Results are float64. With N parts, the opacity o becomes p = 1 - (1 - o)^(1/N), and scales are multiplied by o /
+    sum_{k=1..N} C(N, k) (-1)^(k+1) p^k / sqrt(k) (the paper's rule of relocation; its double sum, with the inner
+    binomials added up). So the parts together are as opaque in the middle as the one Gaussian was, and hide as much in
+    total along any line through the middle.
+
+    logits: (n,), of the Gaussians before.
+    parts: (n,) int64, from 1 to MOST_PARTS.
     """
     before = logits.to(torch.float64).clamp_max(_MOST_LOGIT)
     depth = _softplus(before) / parts  # -ln(1 - p)
@@ -142,7 +154,7 @@ def divided(logits: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _weight(opacity: Tensor, parts: Tensor) -> Tensor:
-    """The sum of `divided` for opacities p (n,)."""
+    """Return the sum of `divided` for opacities p (n,)."""
     table = _coefficients().to(opacity.device)
     total = torch.zeros_like(opacity)
     for coefficients in table.flip(0):  # Horner's scheme, product and sum rounded one by one
@@ -151,7 +163,7 @@ def _weight(opacity: Tensor, parts: Tensor) -> Tensor:
 
 
 def _coefficients() -> Tensor:
-    """C(N, k) (-1)^(k+1) / sqrt(k) in row k - 1 and column N, float64."""
+    """Return C(N, k) (-1)^(k+1) / sqrt(k) in row k - 1 and column N, float64."""
     rows = [
         [math.comb(parts, k) * (-1) ** (k + 1) / math.sqrt(k) for parts in range(MOST_PARTS + 1)]
         for k in range(1, MOST_PARTS + 1)
@@ -160,5 +172,5 @@ def _coefficients() -> Tensor:
 
 
 def _softplus(x: Tensor) -> Tensor:
-    """ln(1 + e^x), float64."""
+    """Return ln(1 + e^x), float64."""
     return x.clamp_min(0.0) + log(1.0 + exp(-x.abs()))

@@ -1,4 +1,4 @@
-"""Photos as cameras make them (--appearance ppisp): their exposure, white balance, vignetting and response."""
+"""A model of photos as cameras make them (--appearance ppisp): exposure, white balance, vignetting and response."""
 
 import argparse
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,10 @@ _RECORDED = "appearance"  # option in model.json, of a training that has one
 
 
 class Ppisp(Appearance):
-    """Trains the numbers of photos and of their cameras. Haze can grow before cameras after a reset of opacities."""
+    """Trains the numbers of photos and of their cameras.
+
+    It allows no resets of opacities, after which haze could grow before cameras.
+    """
 
     name = kind = "ppisp"
     needs = Needs(captured=True, resets=False)
@@ -63,7 +66,7 @@ class Ppisp(Appearance):
         scene.gaussians.save_exposures(scene.model_path)
 
     def load(self, scene: Scene, args: argparse.Namespace) -> None:
-        """Photos of another scene, and of a model that was trained without, have nothing trained."""
+        """Read the trained numbers, unless the photos are of another scene, or the model was trained without them."""
         own = not getattr(args, "other_scene", "") and _RECORDED in read_model_json(args.model_path)
         views = scene.info.train_cameras
         photos = read_appearance(args.model_path, views) if own else PhotoAppearance()
@@ -86,7 +89,7 @@ class Ppisp(Appearance):
 
 
 def fitted_views(photos: PhotoAppearance, pipe: argparse.Namespace, background: Tensor) -> ScoredViews:
-    """Right halves of held-out views, with their photos' exposure and balance from the left ones.
+    """Return views that score the right halves of held-out photos, with exposure and balance fitted to the left halves.
 
     The trained numbers stay as they are (the protocol of Martin-Brualla et al. 2021, NeRF in the Wild).
     """
@@ -104,7 +107,7 @@ def fitted_views(photos: PhotoAppearance, pipe: argparse.Namespace, background: 
 
 
 def exposures(cameras: list[Camera], tracks: list[Track | None]) -> np.ndarray:
-    """Exposures (K,) in stops around their mean, of the photos that have a track."""
+    """Return the exposures (K,) of the photos that have a track, in stops around their mean."""
     colors, points = [], []
     for track, camera in zip(tracks, cameras, strict=True):
         if track is None:

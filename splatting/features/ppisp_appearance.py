@@ -64,23 +64,28 @@ _LN2 = math.log(2)
 
 
 class PhotoAppearance(Exposures):
-    """The numbers of training photos and of their cameras; in the place of `Exposures`.
+    """The numbers of training photos and of their cameras, in the place of `Exposures`.
 
-    values: (n, 3) of the photos. numbers: all tensors by name. mapping: index by the photo's name. held: nothing is
-    learnt, as after a reset of the opacities, when all renders are dark.
+    values: numbers of the photos, (n, 3).
+    numbers: all tensors, by name.
+    mapping: index by the photo's name.
+    held: true while nothing is learnt, as after a reset of the opacities, when all renders are dark.
     """
 
     kind: ClassVar[str] = "ppisp"
     applied = True
 
     def __init__(self, names: Sequence[str] = (), cameras: Sequence[object] = ()) -> None:
-        """cameras: the number of each photo's camera."""
+        """Name the photos and their cameras.
+
+        cameras: the number of each photo's camera.
+        """
         ids = [str(camera) for camera in cameras]
         self.cameras = [_SHARED] * len(ids) if len(set(ids)) == len(ids) else ids  # of each photo
         super().__init__(names)
 
     def start(self, names: Sequence[str]) -> None:
-        """Let the photos and cameras change nothing."""
+        """Begin with photos and cameras that change nothing."""
         self.mapping = {name: index for index, name in enumerate(names)}
         self.rows = {camera: row for row, camera in enumerate(dict.fromkeys(self.cameras))}
         device = compute_device()
@@ -93,11 +98,11 @@ class PhotoAppearance(Exposures):
 
     @property
     def values(self) -> Tensor:
-        """Those of the photos."""
+        """The numbers of the photos."""
         return self.numbers["photos"]
 
     def index(self, name: str | Tensor) -> Tensor:
-        """The index (1,) int64 of a photo, on the device. A recorded step has that in the place of a name."""
+        """Return the index (1,) int64 of a photo, on the device. A recorded step gives the index, not a name."""
         if isinstance(name, Tensor):
             return name
         if name not in self.mapping:
@@ -105,17 +110,17 @@ class PhotoAppearance(Exposures):
         return self._indices[self.mapping[name]]
 
     def camera_of(self, colmap_id: object) -> Tensor | None:
-        """The row (1,) of the camera of any view of the scene, None for one of which no photo has trained."""
+        """Return the row (1,) of a view's camera; None if no photo of that camera has trained."""
         row = self.rows.get(_SHARED, self.rows.get(str(colmap_id)))
         return None if row is None else self._indices[row]
 
     def photo(self, name: str | Tensor) -> Tensor:
-        """Exposure, red against blue, and both against green of a photo (3,), in stops from the mean of all photos."""
+        """Return a photo's exposure, red against blue, and both against green: (3,), stops from the mean of photos."""
         photos = self._read("photos")
         return _row(photos, self.index(name)) - photos.detach().mean(0)
 
     def _response(self, row: Tensor) -> Tensor:
-        """Logarithms of the rises of a camera's response (3, 3), from their mean over all photos."""
+        """Return the logarithms of the rises of a camera's response (3, 3), from their mean over all photos."""
         responses = self._read("response")
         return _row(responses, row) - responses.detach()[self._row_of].mean(0)
 
@@ -123,11 +128,14 @@ class PhotoAppearance(Exposures):
         return name in self.mapping
 
     def shown(self, image: Tensor, name: str | Tensor) -> Tensor:
-        """A render (3, H, W), not clamped, as the photo of this name shows it. Differentiable in the image, too."""
+        """Return a render as the photo of this name shows it. Differentiable in the image, too.
+
+        image: (3, H, W), not clamped.
+        """
         return self._seen(image, _gains(self.photo(name)), self._row_of.index_select(0, self.index(name)))
 
     def pull(self, name: str | Tensor) -> Tensor:
-        """What a step of this photo adds to the loss: sizes of its numbers and its camera's, weighted and smoothed."""
+        """Return the loss term of a photo: sizes of the photo's numbers and its camera's, weighted and smoothed."""
         row = self._row_of.index_select(0, self.index(name))
         found = {"photos": self.photo(name), "response": self._response(row)}
         found |= {kind: _row(self._read(kind), row) for kind in ("vignetting", "middle")}
@@ -135,10 +143,13 @@ class PhotoAppearance(Exposures):
 
     @torch.no_grad()
     def fitted(self, image: Tensor, target: Tensor, counts: Tensor, colmap_id: object) -> Tensor:
-        """A render (3, H, W) of a photo that has not trained, as it shows it, in [0, 1].
+        """Return a render (3, H, W) in [0, 1] as a photo shows it that has not trained.
 
-        The gains of the photo have the least squared difference to the target (3, H, W) where pixels count (1, H, W)
-        bool. Each channel has its own.
+        The gains of the photo, one for each channel, are those of the least squared difference to the photo where
+        pixels count.
+
+        image, target: (3, H, W), the render and the photo.
+        counts: (1, H, W) bool.
         """
         row, gains = self.camera_of(colmap_id), image.new_zeros(3, 1, 1)
         for _ in range(_FITS):
@@ -152,7 +163,11 @@ class PhotoAppearance(Exposures):
         return self._seen(image, gains, row).clamp(0, 1)
 
     def _seen(self, image: Tensor, gains: Tensor, row: Tensor | None) -> Tensor:
-        """gains (3, 1, 1) of the channels in stops. row: of the camera; None: one that changes nothing."""
+        """Return a render as a camera shows it.
+
+        gains: (3, 1, 1), of the channels, in stops.
+        row: row of the camera; None: a camera that changes nothing.
+        """
         gains = _LN2 * gains  # the last bit of torch.exp2 depends on the number of threads
         if row is None:
             return image * exponential(gains)
@@ -187,7 +202,7 @@ class PhotoAppearance(Exposures):
 
     @torch.no_grad()
     def step(self) -> None:
-        """Step if there is a gradient, to a vignetting that nowhere brightens."""
+        """Take a step if there is a gradient, and keep the vignetting one that brightens no place."""
         super().step()
         a, b = self.numbers["vignetting"].unbind(2)
         a.clamp_(max=0)  # once more changes no bit, as in a step that is repeated
@@ -230,12 +245,12 @@ class PhotoAppearance(Exposures):
 
 
 def appearance_of(views: Sequence[CameraInfo]) -> PhotoAppearance:
-    """That of training photos which changes nothing."""
+    """Return an appearance of training photos that changes nothing."""
     return PhotoAppearance(photo_names(views), [view.uid for view in views])
 
 
 def read_appearance(folder: str | os.PathLike, views: Sequence[CameraInfo]) -> PhotoAppearance:
-    """The appearance of photos and their cameras from a model folder. UserError for a file that does not fit them."""
+    """Read the appearance of photos and their cameras from a model folder. UserError for a file of other photos."""
     path, appearance = Path(folder) / NAME, appearance_of(views)
     try:
         table = read_json(path)
@@ -261,14 +276,14 @@ def _row(values: Tensor, index: Tensor) -> Tensor:
 
 
 def _gains(photo: Tensor) -> Tensor:
-    """Stops (3, 1, 1) of red, green and blue, of the numbers of a photo."""
+    """Return the stops (3, 1, 1) of red, green and blue by the numbers of a photo."""
     exposure, red, others = photo.unbind()
     return torch.stack([exposure + red + others, exposure - 2 * others, exposure - red + others])[:, None, None]
 
 
 @cache
 def _places(height: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Places of columns and rows from the middle of an image, in half diagonals."""
+    """Return the places of columns and rows from the middle of an image, in half diagonals."""
     half = 0.5 * (height**2 + width**2) ** 0.5
     with torch.inference_mode(False):  # so that training can use them after a render in inference mode
         return tuple((torch.arange(side, device=device) + 0.5 - side / 2) / half for side in (width, height))

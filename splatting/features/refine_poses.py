@@ -1,4 +1,4 @@
-"""Poses that are trained with the Gaussians (--refine_poses): a small correction of each training camera's."""
+"""Poses that are trained with the Gaussians (--refine_poses): a small correction of each training camera's pose."""
 
 import argparse
 import copy
@@ -27,7 +27,7 @@ _REMEDY = f"save the model again, or {_WITHOUT}"
 
 
 class RefinePoses(Part):
-    """Gives the cameras their poses, which take steps on the host, and keeps them in poses.json."""
+    """Gives the cameras trained poses, whose steps are taken on the host, and keeps the poses in poses.json."""
 
     name = "refine_poses"
     needs = Needs(files=True)
@@ -48,7 +48,7 @@ class RefinePoses(Part):
         fill(run, "camera_steps", self.poses, self)
 
     def ready(self, run: Any) -> None:
-        """Only now cameras leave where they were when a new training began, as other parts have measured them."""
+        """Move the cameras to their trained poses, now that other parts have measured where the cameras were."""
         self.poses.place()
 
     def records(self) -> dict[str, float]:
@@ -58,7 +58,7 @@ class RefinePoses(Part):
         return self.poses.captured()
 
     def scored(self, scene: Scene, pipe: argparse.Namespace, background: Any) -> dict[str, Scored]:
-        """Test views as the dataset has them."""
+        """Return the test views with the dataset's poses."""
         views = [] if self._elsewhere else [copy.copy(camera) for camera in scene.getTestCameras()]
         for camera in views:
             given = scene.given_test_views[camera.uid]
@@ -70,7 +70,7 @@ class RefinePoses(Part):
 
     @staticmethod
     def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
-        """Measure whether tracks ask for other poses."""
+        """Measure whether the tracks suggest other poses."""
         found = pose_errors(scene.info.train_cameras, tracks, scene.cameras_extent) if any(tracks) else None
         if found is not None:
             given, best = found
@@ -92,7 +92,7 @@ def write_poses(folder: str | os.PathLike, train: Sequence[Camera], test: Sequen
 
 
 def with_poses(info: SceneInfo, folder: str | os.PathLike) -> SceneInfo:
-    """A dataset with the poses of a model folder's poses.json. UserError for a file that does not fit the dataset."""
+    """Return a dataset with the poses of a folder's poses.json. UserError for a file that does not fit the dataset."""
     path = Path(folder) / NAME
     try:
         table = dict(read_json(path))

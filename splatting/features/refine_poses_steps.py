@@ -1,7 +1,7 @@
-"""Poses that are trained with the Gaussians (--refine_poses): a bounded correction of each training camera.
+"""Steps of poses that are trained with the Gaussians (--refine_poses): a bounded correction of each training camera.
 
-Each has Adam of its own. The tracks of structure from motion hold the cameras (tracked_poses.py). All numbers lie on
-the host. Of several processes each takes all steps, with the same numbers.
+Each camera has its own averages of Adam. The tracks of structure from motion hold the cameras (`TrackedPoses`). All
+numbers are on the host. Each of several processes takes all steps, with the same numbers.
 """
 
 import math
@@ -31,11 +31,14 @@ _STATE = ("twists", "mean", "square", "counts")
 class PoseRefinement:
     """The corrections of a scene's training cameras. `place` gives the cameras their current poses.
 
-    twists (n, 6) float64, by the cameras' uid.
+    twists: (n, 6) float64, by the cameras' uid.
     """
 
     def __init__(self, scene: Scene, source_path: str, steps: int) -> None:
-        """steps: of the schedule. UserError for a scene without tracks."""
+        """Begin with the poses of least reprojection error. UserError for a scene without tracks.
+
+        steps: length of the schedule.
+        """
         info, unit = scene.info, scene.cameras_extent
         lists = [sorted(of, key=lambda camera: camera.uid) for of in (scene.getTrainCameras(), scene.getTestCameras())]
         self._cameras, count = lists[0] + lists[1], len(lists[0])
@@ -63,14 +66,14 @@ class PoseRefinement:
         print(f"--refine_poses corrects {sum(track is not None for track in tracks)} of {len(tracks)} poses")
 
     def _pose(self, view: int) -> np.ndarray:
-        """The pose of a view: of a training camera by its uid; test views follow."""
+        """Return the pose of a view. The number of a training view is its camera's uid; test views follow."""
         if view not in self._poses:
             twist = self.twists[view] if view < len(self.twists) else np.zeros(6)
             self._poses[view] = moved_pose(self._tracked.starts[view], twist, self._unit)
         return self._poses[view]
 
     def place(self, copy: Camera | None = None) -> None:
-        """Give all cameras their current poses; or a training camera, and a smaller copy of it, its own."""
+        """Give all cameras their current poses; or only one training camera, and a smaller copy of it."""
         views = self._moved.copy() if copy is None else self._moved & {copy.uid}
         for view in views:
             self._put(self._cameras[view], view)
@@ -83,17 +86,20 @@ class PoseRefinement:
         camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
 
     def independent(self, uid: int, pending: Sequence[int]) -> int:
-        """On how many of the last steps a camera's next pose does not depend. pending: the cameras of steps to come."""
+        """Return how many of the last pending steps have no effect on a camera's next pose.
+
+        pending: cameras of the steps to come.
+        """
         taken, most, period = int(self._counts.sum()), len(pending), _PASSES * len(self.twists)
         if (taken + len(pending)) // period > taken // period:
             most = (taken + len(pending)) % period
         return min(most, pending[::-1].index(uid)) if uid in pending else most
 
     def step(self, uid: int, gradient: np.ndarray, step: int) -> None:
-        """Take the step of a camera. step: of the schedule.
+        """Take the step of a camera. A camera without a track takes none, because nothing would hold it.
 
-        gradient: of the image's loss by the camera's numbers (diff_gaussian_rasterization/camera.py). A camera without
-        a track, which nothing would hold, gets none.
+        gradient: gradient of the image's loss by the camera's numbers (diff_gaussian_rasterization/camera.py).
+        step: step of the schedule.
         """
         found = np.zeros(6)
         if (pulled := self._tracked.pulled(uid, self.twists[uid])) is not None:
@@ -115,7 +121,7 @@ class PoseRefinement:
         self._moved.update(views)
 
     def corrections(self) -> dict[str, float]:
-        """How far training cameras are from the dataset's poses, on the mean: turn, and percent of the extent."""
+        """Return the mean change of the dataset's training poses: turn in degrees, shift in percent of the extent."""
         given, now = np.array(self._given), np.array([self._pose(uid) for uid in range(len(self.twists))])
         chords = np.linalg.norm(now[:, :3, :3] - given[:, :3, :3], axis=(1, 2)) / np.sqrt(8)
         centers = [-np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3]) for poses in (now, given)]
@@ -125,17 +131,17 @@ class PoseRefinement:
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
-        """All numbers that steps change."""
+        """All numbers that steps change, by name."""
         return dict(zip(_STATE, self._adam.state, strict=True))
 
     def captured(self) -> dict[str, Any]:
-        """State that a resumed training needs, as plain values."""
+        """Return the state that a resumed training needs, as plain values."""
         return {"names": self._names} | {name: torch.from_numpy(array.copy()) for name, array in self.arrays.items()}
 
     def restore(self, state: dict[str, Any] | None) -> None:
-        """Take the state of `captured()`, for `place`; views that it does not have stay at the dataset's poses.
+        """Take the state of `captured()`. Views that the state does not have stay at the dataset's poses.
 
-        UserError for one that does not fit, or None.
+        UserError for a state that does not fit, or None.
         """
         rows = places(state.get("names"), self._names) if isinstance(state, dict) else None
         shapes = {name: (len(rows or []), *array.shape[1:]) for name, array in self.arrays.items()}
@@ -160,9 +166,9 @@ def _pose_of(camera: Camera) -> np.ndarray:
 
 
 def _drift(poses: list[np.ndarray], unit: float) -> tuple[np.ndarray, np.ndarray]:
-    """Twists (7, 6 n) by which all cameras turn, move and grow apart as one, and the inverse of their products (7, 7).
+    """Return the twists by which all cameras turn, move and grow apart as one, and the inverse of their products.
 
-    About the cameras' middle, for well-conditioned numbers.
+    The twists are (7, 6 n), the inverse is (7, 7). All are about the cameras' middle, for well-conditioned numbers.
     """
     centers = np.array([-pose[:3, :3].T @ pose[:3, 3] for pose in poses])
     twists = np.zeros((7, len(poses), 6))
@@ -180,16 +186,22 @@ _ANCHOR = 1e-3  # weight of each point's squared reprojection error (pixels) in 
 
 
 class TrackedPoses:
-    """The poses of least reprojection error of views. The error, to second order about there, is a part of their loss.
+    """The poses of views with the least reprojection error. The error, to second order, is a part of the views' loss.
 
-    starts: (4, 4) float64 for each view. held: the error's curvature by the twist there; None for a view without a
-    track, which nothing holds. A start counts as the pose of least error, also where the dataset's pose stayed.
+    A start counts as the pose of least error even where the dataset's pose was kept.
+
+    starts: (4, 4) float64 for each view.
+    held: curvature of the error by the twist at the start; None for a view without a track, which nothing holds.
     """
 
     def __init__(
         self, given: Sequence[np.ndarray], tracks: Sequence[Track | None], focals: Sequence[float], unit: float
     ) -> None:
-        """given: the dataset's poses. tracks, focals, unit: as of `pull` (scene/reprojection.py)."""
+        """Find the poses.
+
+        given: the dataset's poses.
+        tracks, focals, unit: as for `pull` (scene/reprojection.py).
+        """
         self.starts, self.held = [], []
         for pose, track, focal in zip(given, tracks, focals, strict=True):
             start = nearest_pose(pose, track, focal, unit, BOUND)
@@ -197,7 +209,7 @@ class TrackedPoses:
             self.held.append(track and pull(start, track, focal, unit).curvature)
 
     def pulled(self, view: int, twist: np.ndarray) -> np.ndarray | None:
-        """The gradient of a view's error by its twist, which is now `twist`; None if not held."""
+        """Return the gradient of a view's error at a twist; None if the view is not held."""
         curvature = self.held[view]
         return None if curvature is None else _ANCHOR * np.einsum("jk,k->j", curvature, twist)
 
@@ -217,11 +229,11 @@ class BoundedAdam:
 
     @property
     def state(self) -> tuple[np.ndarray, ...]:
-        """All arrays, which a resumed training needs."""
+        """All arrays that a resumed training needs."""
         return self.values, self.mean, self.square, self.counts
 
     def step(self, row: int, gradient: np.ndarray, rate: float) -> None:
-        """Take the step of a row. One whose gradient is not finite is only counted."""
+        """Take the step of a row. A gradient that is not finite is counted, but changes nothing else."""
         count = self.counts[row] = float(self.counts[row]) + 1
         if not np.isfinite(gradient).all():
             return

@@ -19,10 +19,11 @@ _LAST = 1.0  # seconds that a finished training waits for one more request
 
 
 class RemoteViewer(Part):
-    """Listens for a viewer, and serves it. Where the caller of a training listens already, it serves that one's.
+    """Listens for a viewer and serves it, or serves the viewer of a caller that listens already.
 
-    Training waits only while the viewer says so. Otherwise a request is answered when it is there, one an iteration.
-    The last iteration's are answered after everything is written, and keep_alive holds the process there.
+    Training waits only while the viewer says so. Otherwise it answers a request when one is there, at most one in an
+    iteration. Requests of the last iteration are answered after everything is written, and keep_alive holds the process
+    there.
     """
 
     name = "remote_viewer"
@@ -67,20 +68,20 @@ class RemoteViewer(Part):
         self._gui.disconnect()
 
     def _serve(self, last: bool) -> None:
-        """Answer until the viewer lets training go on, leaves, or a signal asks to stop."""
+        """Answer requests until the viewer lets training go on, the viewer leaves, or a signal asks to stop."""
         while self._has_request(last) and self._answer():
             if not self._gui.wants_wait(last):
                 return
 
     def _has_request(self, last: bool) -> bool:
-        """Whether a request is there, after waiting for it if the viewer wants that."""
+        """Tell whether a request is there, after waiting for one if the viewer wants that."""
         while self._gui.wants_wait(last) and not self._run.interrupt.requested:
             if self._gui.has_request(_TICK):
                 return True
         return self._gui.has_request(_LAST if last else 0.0) and not self._run.interrupt.requested
 
     def _answer(self) -> bool:
-        """Answer one request; whether the viewer is still there."""
+        """Answer one request. Return whether the viewer is still there."""
         try:
             request = self._gui.receive_request()
             frame = None if request is None else self._frame(request)
@@ -100,9 +101,10 @@ class RemoteViewer(Part):
 
 
 def frame_bytes(request: Request, gaussians: GaussianModel, pipe: argparse.Namespace, background: Tensor) -> memoryview:
-    """RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
+    """Return the RGB bytes (H, W, 3) of the model as `render` shows it: 255 times the colour, truncated.
 
-    pipe: options of the training, which stay as they are; for the frame, the request's two switches count instead.
+    pipe: options of the training, which stay as they are. For this frame, the two switches of the request count
+        instead.
     """
     switches = {"convert_SHs_python": request.shs_python, "compute_cov3D_python": request.rot_scale_python}
     camera, pipe = request.camera(background.device), argparse.Namespace(**vars(pipe) | switches)

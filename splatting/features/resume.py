@@ -1,6 +1,6 @@
-"""Trainings that are resumed by the command that began them (--resume), and last checkpoints, to train further from.
+"""Resumed trainings (--resume): the same command continues a stopped training, or trains a finished one further.
 
-A note in model.json says that a training has reached its end: only then all of its files are complete.
+A note in model.json says that a training has reached its end. Only then all of its files are complete.
 """
 
 import argparse
@@ -33,10 +33,10 @@ _SPEED = 2e8  # bytes that a disk writes in a second, until it has shown how man
 
 
 class Resume(Part):
-    """With --resume, writes a checkpoint from time to time. Leaves one at the end, and notes that it was reached.
+    """Writes checkpoints from time to time (--resume), leaves one at the end, and notes that the end was reached.
 
-    Where a checkpoint is resumed with more photos, every second iteration trains on one of them at first. Checkpoints
-    from then on keep which these were, so that a resumed training has the same order of views.
+    Where a training resumes with more photos, every second iteration trains on a new photo at first. Later checkpoints
+    record the new photos, so that a resumed training has the same order of views.
     """
 
     name = "resume"
@@ -61,7 +61,7 @@ class Resume(Part):
         return self._added
 
     def ready(self, run: Any) -> None:
-        """Say what this training does to that of its folder, once nothing can refuse it."""
+        """Warn that this training replaces a finished one in its folder, once nothing can refuse it."""
         folder = run.dataset.model_path
         if run.start is None and run.group.first and (there := finished(folder)):
             instead = f"; --resume with {there.more} would continue it" if there.checkpoint.is_file() else ""
@@ -93,7 +93,7 @@ class Resume(Part):
         return seconds >= self._before + LEAST and wanted <= SHARE * seconds
 
     def _leaves(self, at: Iteration) -> bool:
-        """Whether the iteration is the last, and leaves a checkpoint."""
+        """Tell whether the iteration is the last one, and leaves a checkpoint."""
         launch = self._run.launch
         return at.last and not launch.no_last_checkpoint and not at.takes(launch.checkpoint_iterations)
 
@@ -117,7 +117,7 @@ class Resume(Part):
             tqdm.write(checkpoint_line(last, self._run.schedule.more), file=sys.stdout)
 
     def _save(self, at: Iteration, name: str = "") -> None:
-        """Write a checkpoint. A disk that is full is told, and ends nothing: nobody has asked for this file."""
+        """Write a checkpoint. A full disk causes a warning and ends nothing, because nobody has asked for this file."""
         try:
             self._run.checkpoints.save(at, name)
         except UserError as error:
@@ -134,9 +134,9 @@ class Resume(Part):
     def prepare(
         cls, dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace, stops: Mapping[str, bool]
     ) -> bool:
-        """Let --resume name the checkpoint to start with. Returns whether there is anything to train.
+        """Choose the checkpoint to start with, if --resume is given. Return whether there is anything to train.
 
-        UserError without a folder, and for a finished training that cannot be continued so.
+        UserError without a folder, and for a finished training that cannot be continued in this way.
         """
         from splatting.folder import folder_of, newest_checkpoint
 
@@ -165,7 +165,10 @@ class End(NamedTuple):
 
 
 def finished(folder: str | os.PathLike) -> End | None:
-    """The end of the training in a model folder, None if it has not reached it. The checkpoint may not be there."""
+    """Return the end of the training in a model folder; None if the training has not reached it.
+
+    The checkpoint may not exist.
+    """
     with contextlib.suppress(UserError, OSError):  # a broken file notes nothing
         note = read_model_json(folder)
         found = note.get(FINISHED)
@@ -185,13 +188,13 @@ def note_finished(run: Any) -> None:
 
 
 def checkpoint_line(path: Path, more: str) -> str:
-    """How to continue a training from its last checkpoint."""
+    """Return a line that says how to continue a training from its last checkpoint."""
     size = f"{path.stat().st_size / 1e6:.3g} MB"
     return f"Last checkpoint: {shlex.quote(str(path))} ({size}); --resume with {more} continues this training"
 
 
 def _continued(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
-    """Whether to continue the finished training of a folder. UserError if it cannot be, or not by --iterations."""
+    """Tell whether to continue a folder's finished training. UserError if it is impossible, or not by --iterations."""
     from splatting.folder import REPLACED, own_folder
 
     there = f"{folder} has a finished training of {end.iteration:,} iterations"

@@ -1,4 +1,4 @@
-"""Photos that a checkpoint has not trained on, by the cameras.json of its folder. They train more often at first."""
+"""New photos: photos that the cameras.json of a checkpoint's folder does not list. They train more often at first."""
 
 import math
 from pathlib import Path
@@ -19,7 +19,7 @@ _CLOSE = 1e-4  # of the extent, and of a rotation's entries: poses that were wri
 
 
 class NewFirst(ViewOrder):
-    """The order in which every second iteration after `since`, up to `until`, trains on a photo of `names`."""
+    """An order of views in which every second iteration after `since`, up to `until`, trains on a photo of `names`."""
 
     def __init__(self, every: ViewOrder, since: int, until: int, names: list[str]) -> None:
         super().__init__(every.cameras, every.seed)
@@ -36,7 +36,7 @@ class NewFirst(ViewOrder):
 
 
 def restored(every: ViewOrder, record: Any) -> ViewOrder:
-    """The order by the record of a checkpoint. UserError if it is broken."""
+    """Return the order of views by the record of a checkpoint. UserError if the record is broken."""
     try:
         return NewFirst(every, **record)
     except TypeError as error:
@@ -44,10 +44,10 @@ def restored(every: ViewOrder, record: Any) -> ViewOrder:
 
 
 def new_photos(run: Any) -> dict[str, Any] | None:
-    """The record of photos that the folder of the checkpoint does not list; None if it lists all, or none of them.
+    """Return the record of photos that the checkpoint's folder does not list; None if it lists all photos, or none.
 
-    UserError for others that have moved, for trained ones that would be held out now, and for the checkpoint's own
-    folder, which keeps which photos its checkpoints have seen.
+    UserError if other photos have moved, if photos that have trained would be held out now, and if the run writes into
+    the checkpoint's own folder, whose list says which photos its checkpoints have seen.
     """
     if not run.start or not (before := _poses_in(Path(run.start).parent)):
         return None
@@ -72,7 +72,7 @@ def new_photos(run: Any) -> dict[str, Any] | None:
 
 
 def _poses_in(folder: Path) -> dict[str, np.ndarray]:
-    """Poses of cameras.json by name, in its order; none if there is no such file, or it is of another form."""
+    """Read the poses of cameras.json by name, in its order; none if the file is missing or of another form."""
     try:
         return {view["img_name"]: _pose(view) for view in read_json(folder / "cameras.json")}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
@@ -80,12 +80,12 @@ def _poses_in(folder: Path) -> dict[str, np.ndarray]:
 
 
 def _pose(record: dict[str, Any]) -> np.ndarray:
-    """Position and rotation (4, 3)."""
+    """Return position and rotation (4, 3)."""
     return np.array([record["position"], *record["rotation"]], float).reshape(4, 3)
 
 
 def _refuse_held_out(run: Any, tests: list[str], count: int, before: list[str]) -> None:
-    """UserError if test views were trained on. With every HOLD-th held out, new names move the count."""
+    """Raise UserError if test views were trained on. New names shift the count of every HOLD-th photo."""
     if tests and run.options.holdout != EVERY:
         raise UserError(
             f"with more photos, --holdout {run.options.holdout} would hold out some that {run.start} was trained on; "
@@ -100,7 +100,7 @@ def _refuse_held_out(run: Any, tests: list[str], count: int, before: list[str]) 
 
 
 def _until(run: Any, names: list[str]) -> int:
-    """The iteration by which new photos have trained as often as the others, at most in the middle of what is left."""
+    """Return the iteration by which new photos have trained as often as the others, at most halfway to the end."""
     since, last, views = run.first_iteration, run.schedule.ends, run.views.cameras
     new = sum(view.image_name in names for view in views)
     count = int(2 * new * (since / max(len(views) - new, 1)))

@@ -24,9 +24,9 @@ from splatting.part import Error, Needs, Part, fill
 
 
 class RobustMask(Part):
-    """Leaves pixels out of the loss by the residuals of all photos so far, and writes at the end what it has left out.
+    """Leaves pixels out of the loss by the residuals of all photos so far, and writes these pixels at the end.
 
-    A step that is taken twice would find the residuals of its first time.
+    No step is taken twice, because the second time would find the residuals of the first.
     """
 
     name = "robust_mask"
@@ -40,12 +40,12 @@ class RobustMask(Part):
         fill(run, "pixel_filter", self, self)
 
     def mask(self, at: Iteration, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor | None:
-        """Pixels that count in a step, of those of a mask; after a reset of opacities, residuals teach nothing."""
+        """Return the pixels that count in a step, within a mask. Residuals teach nothing after opacities were reset."""
         learns = not self._run.strategy.recovers(at.iteration)
         return self.residuals.mask(at.camera, image, target, mask, learns)
 
     def counted(self, camera: Camera) -> Tensor | None:
-        """Pixels of a view that count now."""
+        """Return the pixels of a view that count now."""
         return self.residuals.counted(camera)
 
     def after_step(self, at: Iteration) -> None:
@@ -61,7 +61,7 @@ class RobustMask(Part):
 
     @staticmethod
     def advise_trained(scene: Scene, views: ScoredViews) -> Iterator[Finding]:
-        """Measure what the short training leaves over."""
+        """Measure which differences the short training leaves."""
         share = odd_share(residuals_of(scene.getTrainCameras(), views, scene.gaussians))
         text = f"{share:.0%} of the photos have passers-by, reflections or other things that change"
         text = text if share else "no photo has passers-by, reflections or other things that change"

@@ -1,10 +1,11 @@
-"""Masks of what one photo shows and the others do not, such as passers-by (--robust_mask), from residuals alone.
+"""Residuals for masks of what one photo shows and the others do not, such as passers-by (--robust_mask).
 
-Robust masks from residuals: Sabour et al. 2023 (RobustNeRF), section 4; residuals kept over a training, and a level
-over all photos: Sabour et al. 2024 (SpotLessSplats), section 4. No network is asked. Both look at the size of each
-pixel's residual. Here residuals are averaged with their sign over cells: detail that is not learnt yet cancels out
-there, a passer-by does not. Canny 1986, "A computational approach to edge detection": a second, lower limit for what is
-beside it (hysteresis), as a cell at its edge shows both.
+Masks follow from residuals alone; no network is asked. Robust masks from residuals: Sabour et al. 2023 (RobustNeRF),
+section 4. Residuals kept over a training, and a level over all photos: Sabour et al. 2024 (SpotLessSplats), section 4.
+Both papers take the size of each pixel's residual. Here residuals are averaged with their sign over cells: detail that
+is not learnt yet cancels out in a cell, a passer-by does not. Cells beside an outlier have a second, lower limit
+(hysteresis, as in Canny 1986, "A computational approach to edge detection"), because a cell at the edge of a passer-by
+shows both.
 """
 
 import math
@@ -49,9 +50,11 @@ FEW = 0.2  # of the photos, which a bare wall or a sky may reach after a short t
 class Residuals:
     """The residuals of all training photos so far, and the masks that follow from them.
 
-    share: of a photo, at most, that is masked. residuals (n, CELLS, CELLS), by the cameras' uid; levels (n,): what the
-    largest `share` of a photo's residuals are above, NaN before the first. least: visits of a photo until it is masked.
-    early: visits after which limits are still twice as high, as not all is learnt.
+    share: largest share of a photo that is masked.
+    residuals: (n, CELLS, CELLS), by the cameras' uid.
+    levels: (n,), the value that the largest `share` of a photo's residuals exceed, NaN before the first ones.
+    least: visits of a photo until it is masked.
+    early: visits after which limits are still twice as high, as not all is learnt yet.
     """
 
     least: ClassVar[int] = 2
@@ -68,9 +71,9 @@ class Residuals:
 
     @torch.no_grad()
     def mask(self, camera: Camera, image: Tensor, target: Tensor, mask: Tensor | None, learns: bool) -> Tensor | None:
-        """Pixels of a render that count, (1, H, W) bool, of those of a mask; None if all do.
+        """Return the pixels of a render that count, (1, H, W) bool, within a mask; None if all do.
 
-        learns: whether the residuals of this step tell anything. They are kept once it is taken (`keep`).
+        learns: true if the residuals of this step tell anything. `keep` keeps the residuals once the step is taken.
         """
         uid, self._next = camera.uid, None
         found = self.residuals[uid]
@@ -97,7 +100,7 @@ class Residuals:
         return factor * (1 + self.early / int(self.visits[uid])) * self.levels.nanmedian()
 
     def _outliers(self, uid: int, residuals: Tensor) -> Tensor:
-        """Cells far beyond the level of all photos, without small groups; of more than may be masked, the largest."""
+        """Return the cells far beyond the level of all photos, without small groups; the largest if there are many."""
         outliers = residuals > self._limit(uid, _FACTOR)
         around = {"kernel_size": _AROUND, "stride": 1, "padding": _AROUND // 2}
         most = avg_pool2d(outliers[None].float(), **around, count_include_pad=False) > 0.5
@@ -105,29 +108,29 @@ class Residuals:
         return outliers & near & (residuals > self._level(residuals))
 
     def _counts(self, uid: int, residuals: Tensor, size: Sequence[int]) -> Tensor | None:
-        """Pixels (1, H, W) bool but those of outliers and of cells beside them; None if all count."""
+        """Return all pixels but those of outliers and of cells beside outliers, (1, H, W) bool; None if all count."""
         beside = max_pool2d(self._outliers(uid, residuals)[None].float(), 3, stride=1, padding=1)[0] > 0
         masked = beside & (residuals > self._limit(uid, _BESIDE)) & (residuals > self._level(residuals))
         return interpolate(masked[None, None].float(), size=tuple(size))[0] == 0 if masked.any() else None
 
     def counted(self, camera: Camera) -> Tensor | None:
-        """Pixels of a view that are not masked now, (1, H, W) bool; None if none is, as in test views."""
+        """Return the pixels of a view that are not masked now, (1, H, W) bool; None: no mask, as in test views."""
         if camera not in self.cameras or self.visits[camera.uid] < self.least:
             return None
         return self._counts(camera.uid, self.residuals[camera.uid], (camera.image_height, camera.image_width))
 
     def difference(self, camera: Camera) -> float:
-        """Mean residual of a view's outliers, in [0, 1]; 0 without any."""
+        """Return the mean residual of a view's outliers, in [0, 1]; 0 without any."""
         residuals = self.residuals[camera.uid]
         return float(residuals[self._outliers(camera.uid, residuals)].mean().nan_to_num())
 
     def captured(self) -> dict[str, Any]:
-        """State that a resumed training needs, as plain values."""
+        """Return the state that a resumed training needs, as plain values."""
         state = {name: getattr(self, name).clone() for name in _STATE}
         return {"names": [camera.image_name for camera in self.cameras], **state}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Take the state of `captured()`, which may lack photos. UserError for one that does not fit."""
+        """Take the state of `captured()`, in which photos may be missing. UserError for a state that does not fit."""
         names = [camera.image_name for camera in self.cameras]
         rows = places(state.get("names"), names) if isinstance(state, dict) else None
         shapes = {name: (len(rows or []), *getattr(self, name).shape[1:]) for name in _STATE}
@@ -140,7 +143,7 @@ class Residuals:
 
 @torch.no_grad()
 def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: GaussianModel) -> Residuals:
-    """The residuals and masks of photos after a training that did not keep them."""
+    """Return the residuals and masks of photos after a training that did not keep them."""
     masks = Residuals(cameras, MASKED, gaussians.get_xyz.device)
     masks.least, masks.early = 1, 0  # it is trained
     for camera in cameras:
@@ -150,12 +153,15 @@ def residuals_of(cameras: Sequence[Camera], views: ScoredViews, gaussians: Gauss
 
 
 def odd_share(masks: Residuals) -> float:
-    """Share of the photos that clearly show what the model does not."""
+    """Return the share of the photos that clearly show what the model does not."""
     return fmean(masks.difference(camera) > CLEAR for camera in masks.cameras)
 
 
 def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
-    """|Mean difference| of a render and its photo in the cells, smoothed (CELLS, CELLS); 0 where no pixel counts."""
+    """Return the absolute mean difference of a render and its photo in the cells, smoothed; 0 where no pixel counts.
+
+    The result is (CELLS, CELLS).
+    """
     difference = image.clamp(0, 1) - as_float(target)
     if mask is not None:
         difference = torch.where(mask, difference, 0.0)
@@ -167,7 +173,7 @@ FOLDER = "robust_masks"  # of a model folder: mask files of what was masked at t
 
 
 def write_masks(masks: Residuals, model_path: str | os.PathLike, source_path: str, background: Tensor) -> str:
-    """Write FOLDER and MASK_PICTURE into a model folder, in place of an earlier training's; say what they show."""
+    """Write FOLDER and MASK_PICTURE into a model folder, in place of older ones. Return a line about what they show."""
     model, shares = Path(model_path), {}
     folder, picture = model / FOLDER, model / MASK_PICTURE
     shutil.rmtree(folder, ignore_errors=True)
@@ -191,7 +197,10 @@ def write_masks(masks: Residuals, model_path: str | os.PathLike, source_path: st
 
 
 def _draw(masks: Residuals, shares: dict[str, float], background: Tensor, path: Path) -> None:
-    """Draw photos beside themselves with darker masked parts. shares: of what is masked, the largest first."""
+    """Draw photos beside copies whose masked parts are darker.
+
+    shares: masked shares by photo, the largest first.
+    """
     rows, cameras = [], {camera.image_name: camera for camera in masks.cameras}
     for name in list(shares)[:WORST]:
         photo = as_float(cameras[name].target(background))

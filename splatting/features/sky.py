@@ -15,7 +15,7 @@ from splatting.part import Needs, Part, fill
 
 
 class Sky(Part):
-    """Adds the sky's Gaussians at the start, holds them on their sphere, and asks that nothing stays before them."""
+    """Adds the sky's Gaussians at the start, holds them on their sphere, and keeps the space before them empty."""
 
     name = "sky"
     by_state = True
@@ -55,13 +55,13 @@ class Sky(Part):
 
     @staticmethod
     def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
-        """Measure whether photos show a sky."""
+        """Measure whether the photos show a sky."""
         if len(scene.info.point_cloud.points):
             _, share = find_sky(scene, Shell.around(scene.info))
             yield note(said_of_sky(share), "--sky auto" if share >= FEWEST else "")
 
     @staticmethod
     def backdrop(facts: dict[str, Any], means: Tensor) -> Tensor | None:
-        """Return which Gaussians are far away, large and opaque by intent; None: there is no sky."""
+        """Return a mask of the Gaussians that are far away, large and opaque by intent; None: there is no sky."""
         state = facts.get("sky")
         return Shell.restored(state).rows(means) if state else None

@@ -1,7 +1,8 @@
-"""A sky behind all points (--sky): Gaussians on a far sphere, where photos show directions without any point.
+"""The sphere of a sky behind all points (--sky), with Gaussians in the directions where photos show no point.
 
-They begin with the colours that the photos have there. The sphere is so far away that photos hardly see it move, and
-that no step brings a mean back among the points. The loss asks for no inverse depth there, so nothing stays before it.
+The Gaussians begin with the colours that the photos have there. The sphere is so far away that photos hardly see it
+move, and that no step brings a mean back among the points. The loss pulls the inverse depth in these directions to that
+of the sphere, so nothing stays before it.
 """
 
 import math
@@ -33,9 +34,11 @@ _OPACITY = 0.9  # at first: what lets the background through asks for Gaussians 
 
 
 class Shell:
-    """The sphere of the sky's Gaussians. center (3,), radius: world units.
+    """The sphere of the sky's Gaussians, in world units.
 
-    points (N, 3): where they began; None: not known.
+    center: (3,).
+    radius: radius of the sphere.
+    points: (N, 3), the places where the Gaussians began; None: not known.
     """
 
     def __init__(self, center: list[float], radius: float) -> None:
@@ -44,7 +47,7 @@ class Shell:
         self._known: dict[tuple[int, int, int], PointDepths | None] = {}
 
     def at(self, camera: Camera, scene: Scene) -> PointDepths | None:
-        """Pixels of a view that are far away, as each stands for those around it; None if there are none."""
+        """Return the depths of the sky's pixels in a view, each for the pixels around it; None if there are none."""
         key = camera.uid, camera.image_width, camera.image_height
         if key not in self._known:
             self._known[key] = self._depths(camera, scene.info.train_cameras[camera.uid], scene.cameras_extent)
@@ -65,7 +68,7 @@ class Shell:
 
     @classmethod
     def around(cls, info: SceneInfo) -> "Shell":
-        """The sphere around a scene's cameras and points."""
+        """Return a sphere around a scene's cameras and points."""
         center = -info.nerf_normalization["translate"]
         distances = np.linalg.norm(info.point_cloud.points - center, axis=1)
         radius = max(_EXTENTS * info.extent, _TIMES * float(np.quantile(distances, _NEARLY_ALL)))
@@ -73,7 +76,7 @@ class Shell:
 
     @classmethod
     def restored(cls, state: Any) -> "Shell":
-        """The sphere of `captured()`, without points. UserError for anything else."""
+        """Return the sphere of `captured()`, without points. UserError for anything else."""
         try:
             center, radius = [float(value) for value in state["center"]], float(state["radius"])
             if len(center) != 3 or not all(map(math.isfinite, center)) or not 0 < radius < math.inf:
@@ -85,11 +88,14 @@ class Shell:
         return cls(center, radius)
 
     def captured(self) -> dict[str, Any]:
-        """The sphere as plain values."""
+        """Return the sphere as plain values."""
         return {"center": self.center, "radius": self.radius}
 
     def rows(self, means: Tensor) -> Tensor:
-        """Which of the means (N, 3) are the sky's, (N,) bool: those beyond half of its radius."""
+        """Return a mask of the means that are the sky's, (N,) bool: those beyond half of its radius.
+
+        means: (N, 3).
+        """
         return self._distances2(means) > (0.5 * self.radius) ** 2
 
     def _distances2(self, means: Tensor) -> Tensor:
@@ -98,7 +104,7 @@ class Shell:
 
     @torch.no_grad()
     def hold(self, gaussians: GaussianModel) -> None:
-        """Put the sky's Gaussians back on the sphere, and make those smaller that a split could send away from it."""
+        """Put the sky's Gaussians back on the sphere, and shrink those that a split could send away from it."""
         means, scales = gaussians.raw("xyz"), gaussians.raw("scaling")
         far, center = self.rows(means)[:, None], means.new_tensor(self.center)
         factor = self.radius / square_root(self._distances2(means))
@@ -108,7 +114,7 @@ class Shell:
 
 
 def with_shell(scene: Scene, gaussians: GaussianModel) -> Shell | None:
-    """Add a sky to a model that is to be trained, and say so; None, where points lie in nearly all directions."""
+    """Add a sky to a model that is to be trained, and print so; None where points lie in nearly all directions."""
     sky = Shell.around(scene.info)
     cloud, share = find_sky(scene, sky)
     text = f"--sky auto: {said_of_sky(share)}"
@@ -124,19 +130,19 @@ def with_shell(scene: Scene, gaussians: GaussianModel) -> Shell | None:
 
 
 def resumed_shell(state: Any, scene: Scene) -> Shell:
-    """The sky of a checkpoint, from `captured()`."""
+    """Return the sky of a checkpoint, from `captured()`."""
     sky = Shell.restored(state)
     sky.points = find_sky(scene, sky)[0].points
     return sky
 
 
 def said_of_sky(share: float) -> str:
-    """What a share of `find_sky` says."""
+    """Return a sentence about a share that `find_sky` has found."""
     return f"{share:.1%} of the directions that several photos show look like a far sky: one colour and no points"
 
 
 def find_sky(scene: Scene, sky: Shell) -> tuple[BasicPointCloud, float]:
-    """Points of a sky, and their share of the directions that photos show, as `find_directions`."""
+    """Return points of a sky, and their share of the directions that photos show, as `find_directions` does."""
     return find_directions(scene, sky.center, sky.radius)
 
 
@@ -155,7 +161,13 @@ _MOST = 200_000  # directions all around
 
 
 class _Photo(NamedTuple):
-    """A photo in cells (h, w): colours (h, w, 3), which cells count, are near points (2, h, w), and are smooth."""
+    """A photo in cells (h, w).
+
+    colors: (h, w, 3).
+    counts: cells that count, (h, w) bool.
+    near: cells near points, (2, h, w) bool.
+    smooth: cells that are smooth, (h, w) bool.
+    """
 
     view: CameraInfo
     colors: np.ndarray
@@ -165,9 +177,13 @@ class _Photo(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """What photos show at places (N,): how many photos, with a point near by (2, N), smooth, colours (N, 3), squares.
+    """The sight of all photos at places (N,).
 
-    squares: the mean squared difference of the colours from their mean, on the mean of the channels.
+    photos: number of photos that show the place, (N,).
+    taken: number of these with a point near by, (2, N).
+    smooth: number of these that are smooth there, (N,).
+    colors: mean colour, (N, 3).
+    squares: mean squared difference of the colours from their mean, on the mean of the channels, (N,).
     """
 
     photos: np.ndarray
@@ -178,11 +194,11 @@ class _Seen(NamedTuple):
 
 
 def find_directions(scene: Scene, center: list[float], radius: float) -> tuple[BasicPointCloud, float]:
-    """Points of a sky on a sphere, and their share of the directions that two or more training photos show.
+    """Return points of a sky on a sphere, and their share of the directions that two or more training photos show.
 
     A direction is the sky's if no photo that shows it has a point near by, and all have the same colour there. The
-    share counts only those above the horizon, which are smooth. It is 0 with fewer than FEWEST_POINTS points, and where
-    the photos agree better nearer by.
+    share counts only smooth directions above the horizon. It is 0 with fewer than FEWEST_POINTS points, and where the
+    photos agree better on a surface nearer by.
     """
     info = scene.info
     photos = [_photo(camera, info.train_cameras[camera.uid], info.point_cloud.points)
@@ -202,7 +218,7 @@ def find_directions(scene: Scene, center: list[float], radius: float) -> tuple[B
 
 
 def _is_near(photos: list[_Photo], center: list[float], toward: np.ndarray, radius: float, extent: float) -> bool:
-    """Whether photos agree better on what is in some directions, where they have no points, if it is near."""
+    """Tell whether photos agree better on directions without points if these show something near."""
     far = _look(photos, center + radius * toward, without_points=True)
     for times in _NEARER:
         near = _look(photos, center + times * extent * toward, without_points=True)
@@ -213,7 +229,10 @@ def _is_near(photos: list[_Photo], center: list[float], toward: np.ndarray, radi
 
 
 def _look(photos: list[_Photo], places: np.ndarray, without_points: bool = False) -> _Seen:
-    """What photos show at places (N, 3). without_points: leave out what is near points in a photo."""
+    """Collect the colours and points of the photos at places (N, 3).
+
+    without_points: true to leave out places near points of a photo.
+    """
     shown, smooth = np.zeros((2, len(places)))
     taken, color, square = np.zeros((len(_AROUND), len(places))), *np.zeros((2, len(places), 3))
     for photo in photos:
@@ -234,7 +253,7 @@ def _look(photos: list[_Photo], places: np.ndarray, without_points: bool = False
 
 
 def _directions(views: list[CameraInfo]) -> np.ndarray:
-    """Unit vectors (N, 3) all around, ACROSS over the width of a photo: a Fibonacci lattice (Gonzalez 2010)."""
+    """Return unit vectors (N, 3) all around, ACROSS over the width of a photo: a Fibonacci lattice (Gonzalez 2010)."""
     apart = float(np.median([view.width / view.fx for view in views])) / ACROSS
     count = min(int(4 * math.pi / (0.75**0.5 * apart**2)), _MOST)
     place = np.arange(count) + 0.5
@@ -244,7 +263,7 @@ def _directions(views: list[CameraInfo]) -> np.ndarray:
 
 
 def _photo(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
-    """A photo in cells, ACROSS over its width; cells count where all their pixels count and are opaque."""
+    """Return a photo in cells, ACROSS over its width; a cell counts if all its pixels count and are opaque."""
     black = torch.zeros(3, device=camera.device)
     image, counted = camera.ground_truth(black)
     counts = (image == camera.target(black + 1)).all(0, keepdim=True)
@@ -263,7 +282,7 @@ def _photo(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
 
 
 def _near_points(view: CameraInfo, points: np.ndarray) -> np.ndarray:
-    """Cells of a photo that have a point near by, as near as _AROUND and _SPACINGS say, (2, h, w) bool."""
+    """Return the cells of a photo with a point near by, as near as _AROUND and _SPACINGS say, (2, h, w) bool."""
     cells = np.zeros((max(view.height * ACROSS // view.width, 1), ACROSS), dtype=bool)
     x, y, inside = projected(view, points.astype(np.float64))
     if not inside.any():
@@ -275,6 +294,6 @@ def _near_points(view: CameraInfo, points: np.ndarray) -> np.ndarray:
 
 
 def cell_at(table: np.ndarray, across: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of a table at parts of a photo's width and height, in [0, 1)."""
+    """Return rows and columns of a table at parts of a photo's width and height, in [0, 1)."""
     height, width = table.shape
     return np.minimum(down * height, height - 1).astype(int), np.minimum(across * width, width - 1).astype(int)

@@ -13,7 +13,7 @@ from splatting.part import Part, fill
 
 
 class Sleep(Part):
-    """Lets blocks sleep where that saves something, and a step concerns no row that its view does not see."""
+    """Lets blocks sleep where that saves something, and where a step concerns no row that its view does not see."""
 
     name = "sleep"
 

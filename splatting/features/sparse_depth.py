@@ -1,4 +1,4 @@
-"""Depth by the points of structure from motion (--sparse_depth): each view's own, where its photo has seen them.
+"""Depth by the points of structure from motion (--sparse_depth): each photo's own points, where it has seen them.
 
 Sparse points as supervision of depth: Deng et al. 2022 (DS-NeRF), section 3. No network is asked.
 """
@@ -14,7 +14,7 @@ from utils.system_utils import UserError
 
 
 class SparseDepth(Part):
-    """Adds the depth of a view's points to its loss."""
+    """Adds the depth of a view's points to the view's loss."""
 
     name = "sparse_depth"
     needs = Needs(depth=True, ranks=False, files=True)
@@ -35,7 +35,7 @@ class SparseDepth(Part):
         return {"points": lambda package, mask: points.loss(package["depth"], mask)} if points else {}
 
     def _points_of(self, camera: Camera) -> PointDepths | None:
-        """The points that train a view, at its size; None if there are none."""
+        """Return the points that train a view, at its size; None if there are none."""
         key = camera.uid, camera.image_width, camera.image_height
         if key not in self._known:
             track = self._tracks[camera.uid]

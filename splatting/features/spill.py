@@ -1,7 +1,7 @@
-"""The limit of what a training takes of a GPU (--gpu_memory): SH bands that do not fit lie in the host's memory.
+"""A limit of the GPU memory that a training takes (--gpu_memory): SH bands that do not fit lie in the host's memory.
 
-The limit must begin before the first rows exist, and the most rows of a checkpoint may not fit on the GPU at all. So
-the part gives the model its room in `check`, while the model is empty, not in `begin`.
+The limit must begin before the first rows exist, because the rows of a checkpoint may not fit on the GPU at all. So the
+part provides the model's storage in `check`, while the model is empty, not in `begin`.
 """
 
 import argparse
@@ -24,9 +24,9 @@ _SLOW = 10.0  # milliseconds a step, from which on the bus is named
 
 
 class Spill(Part):
-    """Gives the model its room, says what of it lies on the host, and brings back what fits after a change.
+    """Provides the model's storage, prints how much of it lies on the host, and brings back what fits after a change.
 
-    It is in every training: without the option, a limit begins where a GPU is too small.
+    The part is in every training: without the option, a limit begins where a GPU is too small.
     """
 
     name = "spill"
@@ -59,15 +59,15 @@ class Spill(Part):
 
 
 def refuse_without_gpu(device: str) -> None:
-    """UserError where there is no memory to limit."""
+    """Raise UserError where there is no GPU whose memory could be limited."""
     if device != "cuda":
         raise UserError("--gpu_memory limits the memory of a GPU, and there is none to use; leave it out")
 
 
 def announce(run: Any, memory: GpuMemory) -> None:
-    """Say what lies in the host's memory, now or once there are as many Gaussians as there may be, and what it costs.
+    """Print how much lies in the host's memory, now or with the most Gaussians to come, and the time that this takes.
 
-    Warn if the host has too little for what is expected.
+    Warn if the host has too little memory for the expected number.
     """
     now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size
     later = expected_count(most, now)
@@ -82,7 +82,7 @@ def announce(run: Any, memory: GpuMemory) -> None:
 
 
 def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
-    """Print what the host has to hold, besides photos there; warn if it does not fit."""
+    """Print the memory that the host needs for spilled rows, beside photos there; warn if it does not fit."""
     host = torch.device("cpu")
     pictures = images.planned_bytes if images.keep_on == host else 0
     each = f" for each of {size} processes" if size > 1 else ""
@@ -92,9 +92,10 @@ def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
 
 
 def sentences(memory: GpuMemory, count: int, seen: float, same: bool) -> list[str]:
-    """What to say before a training of so many Gaussians, of which some are spilled.
+    """Return lines to print before a training of `count` Gaussians of which some are spilled.
 
-    seen: the part of them that a step concerns. same: whether the files do not depend on that.
+    seen: share of the Gaussians that a step concerns.
+    same: true if spilling does not change the files.
     """
     spilled = memory.host_bytes(count)
     said = [

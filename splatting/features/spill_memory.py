@@ -1,4 +1,4 @@
-"""How much of a GPU's memory a training takes, and which rows of the SH bands above 0 lie on the host to keep to it."""
+"""GPU memory of a training: the rows of the SH bands above 0 that lie on the host to keep within a limit."""
 
 import math
 
@@ -19,14 +19,16 @@ _WHOLE_STEP = 20  # bytes of a Gaussian besides the estimate, in steps for which
 
 
 def spillable_bytes(gaussians: GaussianModel, count: int) -> int:
-    """Bytes of what of `count` Gaussians may lie in the host's memory: SH bands above 0 and their two averages."""
+    """Return the bytes of `count` Gaussians that the host may hold: SH bands above 0 and their two averages."""
     return count * 4 * 3 * math.prod(gaussians._attributes["f_rest"].shape)
 
 
 def resident_rows(limit: float, count: int, others: float, spillable: float) -> int:
-    """How many rows of what may lie in the host's memory stay on a GPU, of which `limit` bytes may be taken.
+    """Return the number of spillable rows that stay on a GPU of which `limit` bytes may be taken.
 
-    others, spillable: bytes of all else, and of these rows.
+    count: all rows.
+    others: bytes of all that cannot be spilled.
+    spillable: bytes of the rows.
     """
     return max(min(int(count * (limit - others) / spillable), count), 0) if spillable else count
 
@@ -34,13 +36,17 @@ def resident_rows(limit: float, count: int, others: float, spillable: float) -> 
 class GpuMemory(Storage):
     """Decides how many rows of f_rest and its averages stay on the GPU.
 
-    While rows change, new tensors find the GPU's memory taken by the old ones. What lacks room lies on the host until
-    `rebalance` brings it back. limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is
-    spilled. It spills nothing before `reserve` knows the scene.
+    While rows change, new tensors find the GPU's memory taken by the old ones. What lacks memory lies on the host until
+    `rebalance` brings it back. Nothing is spilled before `reserve` knows the scene.
+
+    limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is spilled.
     """
 
     def __init__(self, limit: float, gaussians: GaussianModel, absolute: bool, device: torch.device) -> None:
-        """Take a limit in GiB, 0 for none. absolute: with absolute gradients."""
+        """Take a limit in GiB, 0 for none.
+
+        absolute: true with absolute gradients.
+        """
         self.limit, self._device = int(limit * 2**30), device
         self._each = training_bytes(gaussians, 1, 0, absolute) + _WHOLE_STEP
         self._spillable = spillable_bytes(gaussians, 1)
@@ -51,7 +57,7 @@ class GpuMemory(Storage):
         self._limit_torch(0)
 
     def reserve(self, count: int, scene: Scene) -> None:
-        """Take note of a number of this process's Gaussians that will come: a limit begins where they do not fit."""
+        """Take note of the number of this process's Gaussians to come: a limit begins where they do not fit."""
         self._fixed = PER_PIXEL * largest_view(scene) + photo_bytes(scene.images, self._device)
         if self.limit or self._device.type != "cuda" or not CAN_SPILL:
             return
@@ -61,7 +67,7 @@ class GpuMemory(Storage):
             self._limit_torch(0)
 
     def empty_rows(self, like: Tensor, rows: int) -> Tensor | None:
-        """An uninitialised tensor for so many rows of f_rest; None: all may stay on the GPU."""
+        """Return an uninitialised tensor for so many rows of f_rest; None: all may stay on the GPU."""
         if not self._spills(rows):
             self._limit_torch(0)
             return None
@@ -71,7 +77,7 @@ class GpuMemory(Storage):
         return empty_rows(like, rows, size)
 
     def rebalance(self, gaussians: GaussianModel) -> None:
-        """Bring rows to the GPU for which there is room, now that rows have changed."""
+        """Bring rows to the GPU that fit there, now that rows have changed."""
         if not self.limit or not self._spills(len(gaussians)):
             return
         rest = gaussians.raw("f_rest")
@@ -88,18 +94,18 @@ class GpuMemory(Storage):
         return empty_rows(values, len(values), wanted).copy_(values)
 
     def _resident_bytes(self, like: Tensor, rows: int) -> int:
-        """Bytes of so many rows of one tensor that may stay on the GPU."""
+        """Return the bytes of so many rows of one tensor that may stay on the GPU."""
         return self.resident_rows(rows) * math.prod(like.shape[1:]) * like.element_size()
 
     def _spills(self, count: int) -> bool:
-        """Whether so many rows do not fit with all that a change of them needs."""
+        """Tell whether so many rows do not fit, with all that a change of them needs."""
         return self.limit > 0 and self._needed(count, self.limit) > self.limit
 
     def _needed(self, count: int, limit: int) -> int:
         return self._fixed + max(int(_SPARE * limit), _LEAST_SPARE) + count * self._each
 
     def resident_rows(self, count: int) -> int:
-        """How many of so many rows stay on the GPU."""
+        """Return the number of rows that stay on the GPU, of `count` rows."""
         if not self._spills(count):
             return count
         # The estimate has room for the copy of one of three tensors while rows change, which here lies on the host.
@@ -107,16 +113,16 @@ class GpuMemory(Storage):
         return resident_rows(self.limit, count, others, count * self._spillable)
 
     def host_bytes(self, count: int) -> int:
-        """Bytes of so many Gaussians in the host's memory."""
+        """Return the bytes of so many Gaussians in the host's memory."""
         return self._spillable * (count - self.resident_rows(count)) if self._device.type == "cuda" else 0
 
     def remedy(self, count: int, lacking: float) -> str:
-        """The option, where nobody has set it and what it lets spill of so many Gaussians is what is lacking."""
+        """Return the option as a remedy, if nobody has set it and spilling frees the lacking bytes; otherwise ""."""
         helps = self._device.type == "cuda" and not self.limit and lacking <= count * self._spillable
         return "set --gpu_memory, or " if helps else ""
 
     def _limit_torch(self, near: int) -> None:
-        """Leave torch the limit less so many bytes, or those that spilled tensors have now."""
+        """Leave torch the limit less so many bytes, or less those that spilled tensors have now."""
         if self.limit and self._device.type == "cuda":
             limit_torch(self.limit - max(near, bytes_of()[0]), self._device)
 
@@ -128,7 +134,8 @@ _before: list[float] = []  # the share of the GPU that torch might take before i
 def limit_torch(limit: float, device: torch.device) -> None:
     """Leave torch so many bytes of the GPU; `free_memory` then counts no others.
 
-    Its segments then grow and shrink, as lists that change their size would leave holes of a fifth of the limit.
+    Torch's segments then grow and shrink, because lists that change their size would leave holes of a fifth of the
+    limit.
     """
     if not _before:
         _before.append(torch.cuda.get_per_process_memory_fraction())
@@ -141,6 +148,6 @@ def limit_torch(limit: float, device: torch.device) -> None:
 
 
 def release_torch() -> None:
-    """Let torch take what it might before."""
+    """Let torch take as much as it might before the limit."""
     while _before:
         torch.cuda.set_per_process_memory_fraction(_before.pop())

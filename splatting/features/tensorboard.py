@@ -12,7 +12,7 @@ from splatting.scores import training_report
 
 
 class Tensorboard(Part):
-    """Writes the losses of every tenth iteration, but for testing ones: there `training_report` writes all."""
+    """Writes the losses of every tenth iteration, except testing ones, in which `training_report` writes them."""
 
     name = "tensorboard"
 
@@ -37,7 +37,7 @@ class Tensorboard(Part):
                 self._write()
 
     def _write(self) -> None:
-        """Write what is kept. The GPU is waited for once, and not once for each loss."""
+        """Write the losses that are kept, and wait for the GPU once, not once for each loss."""
         kept, self._kept = self._kept, []
         values = torch.stack([loss.detach() for _, *pair, _ in kept for loss in pair]).cpu().view(-1, 2)
         for (iteration, *_, seconds), (l1, total) in zip(kept, values, strict=True):

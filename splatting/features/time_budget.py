@@ -1,4 +1,4 @@
-"""Trainings that end with their seconds (--time_budget), or in as many iterations as another one (--schedule)."""
+"""Trainings that end after given seconds (--time_budget), or take as many iterations as another run (--schedule)."""
 
 import argparse
 from pathlib import Path
@@ -21,7 +21,7 @@ LEAST = 32  # pixels of the shorter side of a view; a picture is not made smalle
 
 
 class TimeBudget(Part):
-    """Lets each iteration stand for a part of the schedule, and keeps in schedule.json for which.
+    """Lets each iteration stand for a part of the schedule, and records the parts in schedule.json.
 
     Where the time is short for the size of the photos, views are smaller at first.
     """
@@ -49,9 +49,9 @@ class TimeBudget(Part):
 
     @staticmethod
     def _end_in_time(run: Any) -> None:
-        """Let rows change no longer than by default, 1/2 or 5/6 of the schedule, where that is to go on to its end.
+        """Set the end of densification to its default, 1/2 or 5/6 of the schedule, where it is at the schedule's end.
 
-        A run by the clock has few iterations, and needs the last ones for what it has.
+        A run by the clock has few iterations, and needs the last ones to train the Gaussians that it has.
         """
         for name, part in {strategy.until for strategy in run.strategies}:
             if getattr(run.opt, name) >= run.opt.iterations:
@@ -83,12 +83,14 @@ class TimeBudget(Part):
 
 
 class Sizes:
-    """Gives the views of training in the size that their place in the schedule asks for.
+    """Gives the training views the size that their place in the schedule asks for.
 
     A smaller view is made when it is first needed, and kept while its level lasts. The smaller photos take 1 /
-    factor**2 of the memory of the photos, besides these. Where that is too much for a GPU, or where --images_to_load
-    limits the images, they are made again each time. Views of other classes, or with assigned pictures, keep their
-    size. factor: of the last view.
+    factor**2 of the memory of the photos, in addition. Where that is too much for a GPU, or where --images_to_load
+    limits the images, smaller views are made again each time. Views of other classes, or with assigned pictures, keep
+    their size.
+
+    factor: factor of the last view.
     """
 
     def __init__(self, schedule: DecidedSchedule, images: ImageStore) -> None:
@@ -99,15 +101,15 @@ class Sizes:
         self._keeps = True
 
     def factor_at(self, schedule_step: int) -> float:
-        """The factor at an iteration of the schedule."""
+        """Return the factor at an iteration of the schedule."""
         return self._schedule.factor_at(schedule_step)
 
     def smallest(self, camera: View) -> tuple[int, int]:
-        """The smallest size (width, height) in which a view may train."""
+        """Return the smallest size (width, height) in which a view may train."""
         return smaller(camera, max((factor for _, factor in self._schedule.possible_levels), default=1.0))
 
     def view(self, camera: View, schedule_step: int) -> View:
-        """A view as it is trained at an iteration of the schedule. Ask in ascending order."""
+        """Return a view in its size at an iteration of the schedule. Call this in ascending order of iterations."""
         factor = self.factor_at(schedule_step)
         if factor != self.factor:
             self._begin(factor)
@@ -121,7 +123,7 @@ class Sizes:
         return found
 
     def needs(self, camera: View) -> bool:
-        """Whether the pictures of a view will be needed in their own size."""
+        """Tell whether the pictures of a view will be needed in their own size."""
         return camera not in self._made
 
     def _shrinks(self, camera: View) -> bool:
@@ -139,7 +141,7 @@ class Sizes:
 
 
 def smaller(camera: View, factor: float) -> tuple[int, int]:
-    """Size (width, height) of a view whose sides are divided by a factor, or by less if it is small."""
+    """Return the size (width, height) of a view with sides divided by a factor, or by less if the view is small."""
     sides = camera.image_width, camera.image_height
     factor = max(1.0, min(factor, min(sides) / LEAST))
     return tuple(max(1, round(side / factor)) for side in sides)

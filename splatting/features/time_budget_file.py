@@ -1,7 +1,7 @@
-"""The schedule that a run follows, by its options, and schedule.json.
+"""Files of schedules: schedule.json, and the schedule that a run follows by its options.
 
-schedule.json tells how a run with --time_budget went through its schedule, so that another one can do the same. Its
-checkpoints hold the same table, from which a resumed run goes on.
+schedule.json tells how a run with --time_budget went through its schedule, so that another run can do the same.
+Checkpoints of the run hold the same table, from which a resumed run goes on.
 """
 
 import argparse
@@ -21,19 +21,19 @@ _BROKEN = ValueError, TypeError, KeyError, AttributeError, IndexError, OverflowE
 
 
 def table_of(decided: Decided) -> dict[str, Any]:
-    """A schedule as plain values, for a file or a checkpoint."""
+    """Return a schedule as plain values, for a file or a checkpoint."""
     lists = {name: [one._asdict() for one in getattr(decided, name)] for name in ("blocks", "continued")}
     table = decided._asdict() | lists
     return {_SIZES if name == "sizes" else name: value for name, value in table.items()}
 
 
 def write_schedule(path: Path, decided: Decided) -> None:
-    """Write the whole file or none."""
+    """Write a schedule, the whole file or none."""
     write_json(path, table_of(decided))
 
 
 def read_schedule(path: Path) -> Decided:
-    """The schedule of a file. UserError if it is missing or broken."""
+    """Read the schedule of a file. UserError if the file is missing or broken."""
     remedy = f"name the {SCHEDULE} of a run with --time_budget"
     try:
         return _decided(read_json(path))
@@ -102,10 +102,12 @@ def schedule_of(
     share: Callable[[float], float] = lambda seconds: seconds,
     before: Any = None,
 ) -> DecidedSchedule:
-    """The schedule of a run. UserError for one that this run cannot follow.
+    """Return the schedule of a run. UserError for a schedule that this run cannot follow.
 
-    checkpoint: a chkpntN.pth that is resumed, or None. first_iteration: its N, or 0. share: gives all processes the
-    seconds of one. before: the table in the checkpoint, None: it has none.
+    checkpoint: path of the chkpntN.pth that is resumed, or None.
+    first_iteration: its N, or 0.
+    share: function that gives all processes the seconds of one.
+    before: table in the checkpoint, or None.
     """
     if opt.schedule and opt.time_budget:
         raise UserError("--time_budget and --schedule both set the schedule; leave one of them out")
@@ -120,7 +122,7 @@ def schedule_of(
 
 
 def _with_seconds(found: Decided, seconds: float) -> Decided:
-    """A schedule that is resumed with a limit of seconds, or with so many more if it was over."""
+    """Return a schedule to resume with a limit of seconds; a finished one gets so many seconds more."""
     *earlier, last = found.continued or [None]
     if found.ended is not None:
         more = *found.continued, Continued(found.ended, seconds)
@@ -131,7 +133,7 @@ def _with_seconds(found: Decided, seconds: float) -> Decided:
 
 
 def _even(count: int, opt: argparse.Namespace) -> Decided:
-    """The schedule that so many iterations go through in equal parts, with no budget of seconds."""
+    """Return a schedule that `count` iterations go through in equal parts, with no budget of seconds."""
     if not 1 <= count <= _MOST:
         raise UserError(f"--schedule must name iterations between 1 and {_MOST}, or a file, got {count}")
     return Decided(opt.iterations, [Block(count, 0.0, 1 / count, 0.0)], count, 0.0)
@@ -145,7 +147,7 @@ def _recorded(path: Path, opt: argparse.Namespace) -> Decided:
 
 
 def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decided:
-    """A schedule of a file, if the options fit it (UserError)."""
+    """Return a schedule of a file, or raise UserError if the options do not fit it."""
     if found.iterations != opt.iterations:
         raise UserError(
             f"{path} was written for --iterations {found.iterations}, not {opt.iterations}; give --iterations "
@@ -155,7 +157,7 @@ def _fitting(found: Decided, path: Path | str, opt: argparse.Namespace) -> Decid
 
 
 def _resumed(before: Any, checkpoint: str, opt: argparse.Namespace, first_iteration: int) -> Decided:
-    """The schedule so far of the runs that are resumed; one block if their checkpoint has none."""
+    """Return the schedule so far of the runs that are resumed; one block if their checkpoint has no schedule."""
     if before is None:
         over = first_iteration if first_iteration >= opt.iterations else None
         if not over:

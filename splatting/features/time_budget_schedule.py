@@ -34,7 +34,7 @@ AUTO = "auto"  # sizes that are not decided yet
 
 
 class Block(NamedTuple):
-    """Iterations that each do as much of the schedule, from the one after the block before to `last`."""
+    """Iterations that each do the same part of the schedule, from the one after the block before to `last`."""
 
     last: int
     start: float  # part of the schedule that is done before the block, 0 to 1
@@ -43,14 +43,14 @@ class Block(NamedTuple):
 
 
 class Continued(NamedTuple):
-    """A training that was over, and was given more time."""
+    """The continuation of a training that was over, and got more time."""
 
     after: int  # its last iteration then, which took no step
     seconds: float  # more
 
 
 class Decided(NamedTuple):
-    """What a run decided, as schedule.json and checkpoints keep it (time_budget_file.py)."""
+    """The decisions of a run, as schedule.json and checkpoints keep them (time_budget_file.py)."""
 
     iterations: int  # of its schedule
     blocks: list[Block]
@@ -64,11 +64,13 @@ class Decided(NamedTuple):
 
 
 class DecidedSchedule(Schedule):
-    """A schedule that was decided by an earlier run.
+    """A schedule that an earlier run has decided.
 
-    sizes: the name of `levels`, by which views are smaller at first. megapixels: of a view. short: SHORT of the device.
-    an_iteration: Gaussians for each iteration that the clock leaves.
-    random: whether the model began as random points, of which those may be removed that the run cannot train.
+    sizes: name of `levels`, by which views are smaller at first.
+    megapixels: size of a view.
+    short: SHORT of the device.
+    an_iteration: Gaussians for each iteration that fits into the time.
+    random: true if the model began as random points, of which those may be removed that the run cannot train.
     """
 
     megapixels = 1.0
@@ -89,7 +91,7 @@ class DecidedSchedule(Schedule):
         self._rests = {one.after for one in decided.continued}
 
     def progress(self, iteration: int) -> float:
-        """Part of the schedule that is done after an iteration, 0 to 1."""
+        """Return the part of the schedule that is done after an iteration, 0 to 1."""
         if iteration <= 0:
             return 0.0
         index, block = self._block(iteration)
@@ -113,18 +115,19 @@ class DecidedSchedule(Schedule):
 
     @property
     def possible_levels(self) -> Levels:
-        """Those that may come into force."""
+        """The levels that may come into force."""
         return self.levels
 
     def factor_at(self, schedule_step: float) -> float:
-        """Factor of the views' sizes at an iteration of the schedule."""
+        """Return the factor of the views' sizes at an iteration of the schedule."""
         index = bisect_right(self.levels, schedule_step, key=lambda level: level[0] * self.length) - 1
         return self.levels[index][1] if index >= 0 else 1.0
 
     def possible(self, iteration: int) -> float:
-        """Iterations that fit into the budget at the pace of its end, as far as a block before this iteration tells it.
+        """Return the number of iterations that fit into the budget, by the pace that the run will have at its end.
 
-        Smaller views at first say nothing of that pace. Where no block has it, iterations at the present stride.
+        Blocks before this iteration tell that pace, except those with smaller views. Where no block tells it, return
+        the number of iterations at the present stride.
         """
         index, present = self._block(iteration)
         spans = zip([0, *(block.last for block in self.blocks)], self.blocks[:index], self.blocks[1:], strict=False)
@@ -137,7 +140,7 @@ class DecidedSchedule(Schedule):
         return self.seconds / speed if speed > 0 else 1 / present.step
 
     def count_limit(self, iteration: int, count: int, limit: int, aim: int) -> int:
-        """Not more than so few iterations can train, but all that are there stay, except of a random start."""
+        """Return the number of Gaussians that so few iterations can train; present ones stay, except random points."""
         if not self.seconds or (possible := self.possible(iteration)) >= self.length:
             return limit
         trained = max(int(self.an_iteration * possible), 1)
@@ -148,7 +151,7 @@ class DecidedSchedule(Schedule):
         return min(limit, most) if limit else most
 
     def _tell(self, iterations: int, trained: int, aim: int) -> None:
-        """Say once how many Gaussians a time budget trains."""
+        """Print once how many Gaussians a time budget can train."""
         if not self._told:
             self._told = True
             steps, enough = (int(float(f"{count:.2g}")) for count in (iterations, trained))
@@ -176,12 +179,12 @@ class DecidedSchedule(Schedule):
 
     @property
     def decided(self) -> Decided:
-        """All that is decided by now, also of iterations to come."""
+        """All that is decided by now, also about iterations to come."""
         decided = {"sizes": self.sizes, "levels": self.levels, "strategy": self.strategy, "begun": self.begun}
         return self._decided._replace(blocks=self.blocks, ended=self.ends, **decided)
 
     def up_to(self, iteration: int) -> Decided:
-        """The schedule of a run that went no further than an iteration."""
+        """Return the schedule of a run that went no further than an iteration."""
         index, block = self._block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
         return self.decided._replace(blocks=blocks, ended=iteration if self.is_last(iteration) else None)
@@ -191,20 +194,20 @@ class DecidedSchedule(Schedule):
         return index, self.blocks[index]
 
     def _last(self, index: int) -> int:
-        """The iteration before a block."""
+        """Return the last iteration before a block."""
         return self.blocks[index - 1].last if index else 0
 
 
 class TimeBudget(DecidedSchedule):
     """Goes through the schedule as the seconds of training pass, and ends with them.
 
-    A block of iterations does as large a part of what is left of the schedule as it will take of the seconds that are
-    left, at the speed of the blocks before it. So seconds that were lost, by a slow start or by another program, are
-    taken from all that is left. Where so many were lost that iterations would do more than _MOST_SHARE times their
-    usual part, the run takes longer than its budget. Seconds are those of training, with those of the runs that this
-    one resumes, whose blocks are in the schedule. One that was over continues at AGAIN, for as many seconds more.
+    A block of iterations does as large a part of the rest of the schedule as it will take of the seconds that are left,
+    at the speed of the blocks before it. So seconds that were lost, by a slow start or by another program, are taken
+    from all the rest. If so many were lost that iterations would do more than _MOST_SHARE times their usual part, the
+    run takes longer than its budget. Seconds are those of training, and include the runs that this one resumes, whose
+    blocks are in the schedule. A run that was over continues at AGAIN, for as many seconds more.
 
-    share: gives all processes the seconds of one.
+    share: function that gives all processes the seconds of one.
     """
 
     by_clock = True
@@ -227,7 +230,7 @@ class TimeBudget(DecidedSchedule):
         return self.levels or (PYRAMID if self._open else ())
 
     def best_strategy(self, run: Any) -> str:
-        """The one that is best in the seconds, of those that the run's parts work with."""
+        """Return the strategy that is best in the seconds, among those that the run's parts work with."""
         against = {conflict for part in run.parts for conflict in part.against}  # such as a sky that was found
         fit = [one for one in run.strategies if f"strategy={one.name}" not in against]
         best = (one.name for one in fit if one.best_in(self.seconds, run))
@@ -254,7 +257,7 @@ class TimeBudget(DecidedSchedule):
             self._decide(seconds)
 
     def _measure(self, seconds: float) -> None:
-        """Take the speed of the block that is done, if this run has taken it."""
+        """Measure the speed of the last block, if this run has taken it."""
         if not self.blocks or self.blocks[-1].last == self._first:
             return
         block, before = self.blocks[-1], self._last(len(self.blocks) - 1)
@@ -266,9 +269,9 @@ class TimeBudget(DecidedSchedule):
             self._speeds = [*self._speeds[-2:], speed]
 
     def _choose_sizes(self, done: int, seconds: float) -> None:
-        """Take smaller views if few pixels can be trained: from the next one on, as is recorded.
+        """Choose smaller views, from the next iteration on, if few pixels can be trained.
 
-        The first views are never smaller, as they tell the pace of the end.
+        The first views are never smaller, because they tell the pace of the end.
         """
         self._open = False
         now = (self.schedule_step(done) + 0.5) / self.length
@@ -279,7 +282,7 @@ class TimeBudget(DecidedSchedule):
             self.levels = ((now, begun), *(level for level in PYRAMID if level[0] > now))
 
     def _decide(self, seconds: float) -> None:
-        """Add the block that comes next."""
+        """Add the next block."""
         before = self.blocks[-1].last if self.blocks else 0
         done = AGAIN if self.rests(before) else self.progress(before)
         iterations = self._iterations(seconds - self.begun, (1.0 - done) / (1.0 - AGAIN if self._rests else 1.0))
@@ -301,9 +304,10 @@ class TimeBudget(DecidedSchedule):
             )
 
     def _iterations(self, seconds: float, undone: float) -> float:
-        """Iterations that the run has yet to take, infinite where no speed is known.
+        """Return the number of iterations that the run has yet to take, infinite where no speed is known.
 
-        seconds: of its limit, that have passed. undone: part of what it is to do of the schedule.
+        seconds: seconds of the limit that have passed.
+        undone: share that is left of the part of the schedule which the run has to do.
         """
         left = max(self._limit - seconds, 0.0)
         if self._speed is None:
@@ -321,7 +325,10 @@ class TimeBudget(DecidedSchedule):
         return max(left / self._speed, math.ceil(undone / (_MOST_SHARE * usual)))
 
     def _count(self, iterations: float) -> tuple[int, bool]:
-        """Iterations of the next block, and whether the run ends with it. iterations: that are left."""
+        """Return the number of iterations of the next block, and whether the run ends with it.
+
+        iterations: number of iterations that are left.
+        """
         if iterations == 0.0:
             return 1, True
         if self._speed is None:

@@ -1,4 +1,4 @@
-"""Recorder of a model's error against its run time of training; it changes no bit of the model."""
+"""The recorder of a model's error over its training time; it changes no bit of the model."""
 
 import contextlib
 import random
@@ -33,14 +33,20 @@ View = TypeVar("View")
 def curve_points(
     iterations: int, whole: Iterable[int], sets: int, views: int, taken: float | None = None
 ) -> tuple[frozenset[int], int]:
-    """The iterations that a curve scores between those of `whole`, which score all views; and how many views of a set.
+    """Return the iterations that a curve scores besides `whole`, and how many views of a set it scores there.
 
-    The points are evenly spaced in the logarithm of the iteration, and follow from the options alone, so that the same
+    The points are evenly spaced in the logarithm of the iteration. They follow from the options alone, so that the same
     command scores the same on every machine. They score as many views as fit SHARE of the training, at least one, on
-    the coarse grid; all views on the fine one where that fits, too. A part is a power of two, so that runs of nearly as
-    many iterations score the same one. One of FEW_VIEWS would tell little of all, so these are scored at fewer points,
-    if need be without train views. sets: of `views` each. taken: the iterations of a run whose schedule has
-    `iterations`, None: the same. Then there is the coarse grid alone.
+    the coarse grid; all views on the fine grid where that fits, too. A part is a power of two, so that runs of nearly
+    as many iterations score the same part. One of FEW_VIEWS would tell little of all, so these are scored at fewer
+    points, if need be without train views.
+
+    iterations: last iteration of the schedule.
+    whole: iterations that score all views.
+    sets: number of sets.
+    views: number of views of each set.
+    taken: iterations of a run whose schedule has `iterations`, None: the same number. With a number there is the coarse
+        grid alone.
     """
     (fine, many), coarse = GRIDS
     if iterations < SHORTEST or (taken is not None and coarse[1] * VIEW_COST > MOST_SHARE * taken):
@@ -59,28 +65,30 @@ def curve_points(
 
 
 def evenly_spread(views: Sequence[View], count: int) -> list[View]:
-    """`count` of the views, or all if there are fewer; with two or more, the first and the last are among them."""
+    """Return `count` of the views, or all if there are fewer; the first and the last are among two or more."""
     count = min(count, len(views))
     return [views[round(index * (len(views) - 1) / max(count - 1, 1))] for index in range(count)]
 
 
 def drawn(views: Sequence[View], count: int) -> list[View]:
-    """`count` of the views, drawn with a fixed seed and in their order. A larger count has those of a smaller one."""
+    """Draw `count` of the views with a fixed seed, in their order. A larger count includes those of a smaller one."""
     indices = list(range(len(views)))
     random.Random(0).shuffle(indices)
     return [views[index] for index in sorted(indices[:count])]
 
 
 def _means(name: str, of_views: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """The mean of each score of a set's views that have it, by column."""
+    """Return the mean of each score over the views of a set that have the score, by column."""
     kinds = dict.fromkeys(kind for scores in of_views for kind in scores)
     return {f"{name}_{kind}": round(fmean(x[kind] for x in of_views if kind in x), 6) for kind in kinds}
 
 
 class CurveDrawer:
-    """A process that draws the curve of a folder: matplotlib takes a second, and training has other things to do.
+    """A process that draws the curve of a folder, because matplotlib takes a second that training has better use for.
 
-    `begin`, `draw`, `finish` in that order; `abandon` at any time. views: how many each set has, for the legend.
+    Call `begin`, `draw` and `finish` in that order; `abandon` at any time.
+
+    views: number of views of each set, for the legend.
     """
 
     def __init__(self, folder: Path, views: Mapping[str, int]) -> None:
@@ -89,7 +97,7 @@ class CurveDrawer:
         self._process: subprocess.Popen | None = None
 
     def begin(self) -> None:
-        """Start the process, unless that was done, so that it imports matplotlib meanwhile."""
+        """Start the process, unless it runs already, so that it imports matplotlib meanwhile."""
         if self._process is not None:
             return
         files = [str(self._folder / name) for name in (NAME, FIGURE)]
@@ -103,7 +111,7 @@ class CurveDrawer:
             )  # fmt: skip
 
     def draw(self) -> None:
-        """Draw what the file has now."""
+        """Let the process draw the rows that the file has now."""
         if self._process is not None and self._process.stdin.closed:  # drawn where a repeated training went on
             self.abandon()
             self._process = None
@@ -114,7 +122,7 @@ class CurveDrawer:
                 self._process.stdin.close()
 
     def finish(self) -> str | None:
-        """Wait until it is drawn. Returns what went wrong, None if nothing did."""
+        """Wait until the curve is drawn. Return what went wrong, None if nothing did."""
         if self._process is None:
             return "no process can be started to draw it"
         try:
@@ -134,15 +142,22 @@ class CurveDrawer:
 
 
 class CurveRecorder:
-    """Scores views in the iterations of a plan, keeps the curve's file up to date, and draws it at the end.
+    """Scores views in the iterations of a plan, keeps the curve's file up to date, and draws the curve at the end.
 
-    rows: those of the runs that this one resumes; `log` has their seconds. Iterations are those of the schedule, which
-    are those of the run if it is `steady`. iterations: the last one; always: those that score all views, as the last
-    one does. Those between score a part of each set, the same at all (`curve_points`, `drawn`). Where all views are
-    scored, that part has a row of its own, before theirs. A run that is not steady has no points between until it is
-    known how many iterations it takes. views: those to score, by set, "test" and "train". load(views) decodes their
-    photos; scores(view) gives the scores of one by name, none if no pixel counts. If the file cannot be written, one
-    warning says so and the next point tries again: a training is worth more than its curve.
+    Iterations are those of the schedule. The last one and those of `always` score all views. Iterations between score a
+    part of each set, which is always the same (`curve_points`, `drawn`). Where all views are scored, that part has a
+    row of its own, before theirs. A run that is not steady has no points between until its number of iterations is
+    known. If the file cannot be written, one warning says so and the next point tries again: a training is worth more
+    than its curve.
+
+    rows: rows of the runs that this one resumes.
+    log: log of the training, with the seconds of these runs.
+    iterations: the last iteration.
+    always: iterations that score all views.
+    views: views to score, by set, "test" and "train".
+    load: function that decodes the photos of views.
+    scores: function that returns the scores of a view by name, none if no pixel counts.
+    steady: true if the iterations of the run are those of the schedule.
     """
 
     def __init__(
@@ -180,7 +195,7 @@ class CurveRecorder:
         self._ahead = AHEAD if cores() >= MANY_CORES else 0.0
 
     def _plan(self, taken: float) -> None:
-        """Choose points for a run that takes so many iterations, and the part of the views that they score."""
+        """Choose the points of a run that takes so many iterations, and the part of the views that they score."""
         self._planned = taken
         count = len(self._all["test"])
         between, size = curve_points(
@@ -196,18 +211,22 @@ class CurveRecorder:
         self._points = self._whole | between
 
     def _subset(self, part: Mapping[str, Sequence[int]]) -> int | None:
-        """The number of test views in a part of the sets, None for all of them."""
+        """Return the number of test views in a part of the sets, None if it has all of them."""
         return len(part["test"]) if len(part["test"]) < len(self._all["test"]) else None
 
     def point(self, span: range) -> int | None:
-        """The iteration to score of those that a step stands for; None: none of them."""
+        """Return the iteration to score among those that a step stands for; None: there is none."""
         return max(self._points.intersection(span), default=None)
 
     def due(self, span: range, first: int, seconds: float, taken: float | None = None) -> bool:
-        """Whether to `add` a point in the step of a span; if so, it waits for the GPU.
+        """Tell whether to `add` a point in the step of a span. If so, wait for the GPU.
 
-        seconds: of training since iteration `first`. taken: the number of iterations of a run that is not steady, as
-        far as it is known. Shortly before the end it gets ready to draw.
+        Shortly before the end, the drawing process starts, too.
+
+        span: iterations that the step stands for.
+        first: iteration of the schedule at which this run began.
+        seconds: seconds of training since then.
+        taken: number of iterations of a run that is not steady, as far as it is known.
         """
         if not span:
             return False
@@ -222,10 +241,12 @@ class CurveRecorder:
         return due
 
     def add(self, iteration: int, seconds: float, gaussians: int, trained: int | None = None) -> None:
-        """Score after `seconds` of training in this run, and write the curve with the new point.
+        """Score the views, and write the curve with the new point. The last point also starts the drawing.
 
-        With the last one, it is being drawn from then on until `finish`. trained: iteration of the run, where that is
-        another one.
+        iteration: iteration of the schedule.
+        seconds: seconds of training in this run.
+        gaussians: number of Gaussians.
+        trained: iteration of the run, None: the same.
         """
         # The peaks of log and curve, because after an error the curve may have rows beyond the log's last record.
         peaks = [self._log.peak_memory_mib(), *(row["peak_memory_mib"] for row in self.rows[-1:])]
@@ -255,7 +276,7 @@ class CurveRecorder:
         self._spent[part] += running_seconds() - start
 
     def _score(self, row: Row, parts: Sequence[Mapping[str, Sequence[int]]]) -> None:
-        """Add a row for each of the parts, of which the last has all views of the others."""
+        """Add a row for each of the parts, the last of which has all views of the others."""
         scores = {name: {i: self._scores(self._views[name][i]) for i in of_set} for name, of_set in parts[-1].items()}
         for part in parts:
             means = {SUBSET: self._subset(part)}
@@ -272,11 +293,13 @@ class CurveRecorder:
             self._warned = True
 
     def finish(self, seconds: float, saved: Container[int], steady: bool) -> None:
-        """Wait for the figure, say where it is, and give `peak_advice`.
+        """Wait for the figure, print where it is, and give `peak_advice`.
 
-        seconds: of training in this run. The log's last record gets the costs: `curve_scoring_seconds`,
-        `curve_writing_seconds` (of the file), `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of
-        photos, before the first scoring).
+        The log's last record gets the costs: `curve_scoring_seconds`, `curve_writing_seconds` (of the file),
+        `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of photos, before the first scoring).
+
+        seconds: seconds of training in this run.
+        saved, steady: as for `peak_advice`.
         """
         if writes_files():
             self._timed("drawing", self._draw)
@@ -295,5 +318,5 @@ class CurveRecorder:
             print(f"warning: no {FIGURE}: {failure}", file=sys.stderr)
 
     def abandon(self) -> None:
-        """Draw nothing: the training did not reach its end."""
+        """Draw nothing, as the training did not reach its end."""
         self._drawer.abandon()

@@ -31,15 +31,16 @@ Row = dict[str, float | None]
 
 
 def read_curve(path: str | os.PathLike) -> list[Row]:
-    """Rows of a training's curve in ascending iterations; each has all COLUMNS, None for an empty field.
+    """Read the rows of a training's curve, in ascending iterations; each has all COLUMNS, None for an empty field.
 
     An iteration has a row for each part of the test views that was scored there. Estimates in older files are left out.
+    UserError if the file is missing or damaged. Columns:
 
-    seconds: of training, without evaluation and saving, over all resumed parts. wall_seconds: since the start of the
-    process, with those of earlier parts. peak_memory_mib: the most of all parts so far, of the GPU if it trains.
-    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: gaussian_renderer/scored_views.py. subset: number of views of
-    each set that were scored, the same ones in all rows of that number; None: all. UserError if the file is missing or
-    damaged.
+    seconds: seconds of training, without evaluation and saving, over all resumed parts.
+    wall_seconds: seconds since the start of the process, with those of earlier parts.
+    peak_memory_mib: the most memory of all parts so far, of the GPU if it trains.
+    `<views>_l1`, `<views>_psnr` (dB), `<views>_ssim`: scores, as in gaussian_renderer/scored_views.py.
+    subset: number of views of each set that were scored, the same views in all rows of that number; None: all.
     """
     try:
         header, *lines = _lines(path)
@@ -58,20 +59,25 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
 
 
 def _lines(path: str | os.PathLike) -> list[list[str]]:
-    """Lines of a CSV file, stripped fields, the header first."""
+    """Return the lines of a CSV file as lists of stripped fields, the header first."""
     with open(path, encoding=encoding_of(path), newline="") as file:
         return [[field.strip() for field in line] for line in csv.reader(file, strict=True) if line] or [[]]
 
 
 def _without(name: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> list[Sequence[str]]:
-    """The lines that have nothing in the column of that name."""
+    """Return the lines whose field in the column `name` is empty."""
     return [line for line in lines if not dict(zip(header, line, strict=True)).get(name)]
 
 
 def _row(
     header: Sequence[str], line: Sequence[str], columns: Sequence[str], required: Sequence[str], counts: Sequence[str]
 ) -> Row:
-    """A line's values of `columns`; None for empty ones, of which none may be required. counts: whole numbers."""
+    """Return a line's values of `columns`, None for empty fields.
+
+    ValueError for an empty field that is required.
+
+    counts: columns of whole numbers.
+    """
     fields, row = dict(zip(header, line, strict=True)), {}
     for name in columns:
         text = fields.get(name, "")
@@ -97,11 +103,12 @@ def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
 def continue_curve(
     model_path: str | os.PathLike, first_iteration: int, before: str | os.PathLike | None = None
 ) -> list[Row]:
-    """Rows of the curve in a model folder up to `first_iteration`, where a run resumes (0: it starts anew).
+    """Return the rows of the curve in a model folder up to `first_iteration`, where a run resumes (0: a new run).
 
     Later rows belong to another training and are removed, with the figure. A file without rows is removed. A damaged
-    file is removed with a warning, since it is no reason to stop a training. before: the folder of the run that is
-    resumed, if it is another one; nothing changes there.
+    file is removed with a warning, since it is no reason to stop a training.
+
+    before: folder of the run that is resumed, if it is another one; nothing changes there.
     """
     path = Path(model_path) / NAME
     source = path if before is None else Path(before) / NAME
@@ -121,19 +128,19 @@ def continue_curve(
 
 
 def rows_on(rows: Iterable[Row], subset: float | None) -> list[Row]:
-    """The rows that score a subset, None: whole sets. Only rows on the same views compare."""
+    """Return the rows that score a subset, None: whole sets. Only rows on the same views compare."""
     return [row for row in rows if row.get(SUBSET) == subset]
 
 
 def whole_sets(rows: Iterable[Row]) -> list[Row]:
-    """The rows that score whole sets. Only these compare with scores of other places."""
+    """Return the rows that score whole sets. Only these rows compare with scores from elsewhere."""
     return rows_on(rows, None)
 
 
 def common_subset(curves: Iterable[Iterable[Row]]) -> int | None:
-    """The subset, None: whole sets, on which curves compare: of those that all have, the one with the most points.
+    """Return the subset on which curves compare: the one with the most points of those that all curves have.
 
-    The curve with the fewest points decides. Curves without test PSNR have no say.
+    None means whole sets. The curve with the fewest points decides. Curves without test PSNR do not take part.
     """
     found = [Counter(row.get(SUBSET) for row in curve if row["test_psnr"] is not None) for curve in curves]
     counts = [count for count in found if count]
@@ -142,13 +149,13 @@ def common_subset(curves: Iterable[Iterable[Row]]) -> int | None:
 
 
 def best_test(rows: Iterable[Row]) -> Row | None:
-    """The whole-set row with the highest PSNR of the test views, the first of equals; None if no row has one."""
+    """Return the whole-set row with the highest PSNR of the test views, the first of equals; None if no row has one."""
     scored = [row for row in whole_sets(rows) if row["test_psnr"] is not None]
     return max(scored, key=lambda row: row["test_psnr"], default=None)
 
 
 def gain_since_peak(rows: Sequence[Row]) -> float | None:
-    """PSNR that training views gained while test views lost (`peak`); None if either is not CLEAR."""
+    """Return the PSNR that training views gained while test views lost (`peak`); None if either is not CLEAR."""
     found, end = peak(rows), whole_sets(rows)
     # What does not fit the training views cannot overfit.
     if found is None or found[0]["train_psnr"] is None or (end[-1]["train_psnr"] or 0.0) < FITTED:
@@ -158,7 +165,7 @@ def gain_since_peak(rows: Sequence[Row]) -> float | None:
 
 
 def peak(rows: Sequence[Row]) -> tuple[Row, float] | None:
-    """The whole-set row with the best test views, and how much PSNR was lost since; None if that is not CLEAR."""
+    """Return the whole-set row with the best test views, and the PSNR lost since; None if the loss is not CLEAR."""
     rows = whole_sets(rows)
     best = best_test(rows)
     if best is None or rows[-1]["test_psnr"] is None:
@@ -168,10 +175,11 @@ def peak(rows: Sequence[Row]) -> tuple[Row, float] | None:
 
 
 def peak_advice(rows: Sequence[Row], saved: Container[int], steady: bool = True) -> str | None:
-    """A line that names the iteration with the best test views; None unless they were clearly worse in the last row.
+    """Return a line that names the iteration with the best test views; None unless the last row was clearly worse.
 
-    saved: iterations whose PLY this training has written, before the iteration's step, so that it is the model that was
-    scored. steady: whether another training has the same iterations, which one by the clock has not.
+    saved: iterations whose PLY this training has written. Each was written before the iteration's step, so it is the
+        model that was scored.
+    steady: true if another training has the same iterations; one by the clock has not.
     """
     if (found := peak(rows)) is None:
         return None
@@ -186,8 +194,8 @@ def peak_advice(rows: Sequence[Row], saved: Container[int], steady: bool = True)
 def read_peer(path: Path, required: Sequence[str] = PEER_REQUIRED) -> list[Row]:
     """Read another program's curve: rows in the order of their seconds, with all PEER_COLUMNS, None if not known.
 
-    The first line names the columns, in any order; only those required, seconds among them, must be there, and other
-    names are ignored. UserError for anything else.
+    The first line names the columns, in any order. Only the required columns, seconds among them, must be there, and
+    other names are ignored. UserError for anything else.
     """
     try:
         header, *lines = _lines(path)
@@ -219,8 +227,10 @@ def write_peer(path: Path, rows: Sequence[Row]) -> None:
 def peers_of(given: Sequence[Sequence[str]], scenes: Sequence[str]) -> list[dict[str, Any]]:
     """Read the peers that the command line names, as report.json lists them: scene, name, file, curve.
 
-    given: (name, file) of each --peer. Where there are several scenes, a name is SCENE/NAME. UserError for other names
-    and unreadable files.
+    UserError for other names and unreadable files.
+
+    given: (name, file) of each --peer. A name is SCENE/NAME where there are several scenes.
+    scenes: names of the scenes.
     """
     peers: dict[tuple[str, str], dict[str, Any]] = {}
     for title, file in given:

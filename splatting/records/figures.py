@@ -44,13 +44,13 @@ def psnr(row: Row, views: str) -> float | None:
 
 
 def dissimilarity(row: Row, views: str) -> float | None:
-    """1 - SSIM; None for equal images, which have no place on a logarithmic axis."""
+    """Return 1 - SSIM; None for equal images, which have no place on a logarithmic axis."""
     ssim = row[f"{views}_ssim"]
     return None if ssim is None or ssim >= 1 else 1 - ssim
 
 
 def _points(rows: Sequence[Row], value: Value, views: str) -> list[Point]:
-    """Seconds and values of the rows that have them; the axis of the seconds is logarithmic."""
+    """Return seconds and values of the rows that have both; seconds must be above 0 on a logarithmic axis."""
     pairs = ((row["seconds"], value(row, views)) for row in rows)
     return [(seconds, number) for seconds, number in pairs if seconds > 0 and number is not None]
 
@@ -60,7 +60,12 @@ def _draw(axes: Axes, points: Sequence[Point], label: str | None, **style: Any) 
 
 
 def _views_text(subset: int | None, count: int | None, kind: str = "test") -> str:
-    """Which views of a set of so many points score; count: None where it differs. Few of the train views are."""
+    """Return a text that says which views of a set are scored. Of the train views, only a few ever are.
+
+    subset: number of views that are scored, None: all.
+    count: number of views in the set; None where it differs.
+    kind: "test" or "train".
+    """
     if kind == "train":
         return f"{count if subset is None else subset:,} train views"
     if subset is None:
@@ -69,10 +74,10 @@ def _views_text(subset: int | None, count: int | None, kind: str = "test") -> st
 
 
 def _label(axes: Axes, x: str, y: str, log: bool = False) -> None:
-    """Label axes, of which that of x is logarithmic, and that of y if `log`, where there is something to show.
+    """Label the axes, and make x logarithmic, and y if `log`, where there is something to show.
 
-    Logarithmic ones are labelled at 1, 2, 5, 10, 20, ..., and that of y, which spans less, at 3, too: matplotlib's own
-    labels 3 x 10^0 and 4 x 10^0 overlap.
+    Logarithmic axes are labelled at 1, 2, 5, 10, 20, ..., and y, which spans less, at 3, too: matplotlib's own labels 3
+    x 10^0 and 4 x 10^0 overlap.
     """
     from matplotlib.ticker import LogLocator, NullFormatter
 
@@ -89,7 +94,7 @@ def _label(axes: Axes, x: str, y: str, log: bool = False) -> None:
 
 @cache
 def _forget_settings() -> None:
-    """Those of a matplotlibrc in the folder that a user works in, which may call for TeX, would count."""
+    """Forget the settings of a matplotlibrc in the folder that a user works in, which may call for TeX."""
     from matplotlib import rcdefaults
 
     rcdefaults()
@@ -113,9 +118,10 @@ def save_figure(figure: Figure, path: str | os.PathLike, dpi: int = 120) -> None
 def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapping[str, int]) -> None:
     """Draw PSNR and 1 - SSIM of test and train views against seconds of training, the gap between both shaded.
 
-    Each subset of the views has a line of its own, and whole sets beside it have one that is dotted and hollow. views:
-    how many each set has. Raises matplotlib's errors, ImportError if it is missing, and UserError if `path`
-    cannot be written.
+    Each subset of the views has a line of its own; whole sets beside it have a dotted and hollow line. Raises
+    matplotlib's errors, ImportError if it is missing, and UserError if `path` cannot be written.
+
+    views: number of views of each set.
     """
     figure, (upper, lower) = _figure(2, (7.5, 7.0), title)
     subsets = {int(row[SUBSET]) for row in rows if row[SUBSET] is not None}
@@ -143,7 +149,7 @@ def draw_curve(path: str | os.PathLike, rows: list[Row], title: str, views: Mapp
 
 
 def _shade_gap(axes: Axes, rows: Sequence[Row], end: Sequence[Row], value: Value, unit: str, views: int) -> None:
-    """Shade the gap between test and train views at rows of both, and tell that of the last row, `end`."""
+    """Shade the gap between test and train views at rows that have both, and state the gap of the last row, `end`."""
     lines, label = [[value(row, name) for row in rows] for name in COLORS], None
     if len(rows) > 1:
         test, train = (value(end[0], name) for name in COLORS)
@@ -153,9 +159,10 @@ def _shade_gap(axes: Axes, rows: Sequence[Row], end: Sequence[Row], value: Value
 
 
 def _panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Callable[[Axes], str | None]) -> Path:
-    """Write a figure of one panel, whose legend lies below it. draw: draws into axes, and returns the legend's title.
+    """Write a figure of one panel, whose legend lies below it.
 
-    log: whether the axis of y is logarithmic.
+    log: true if the y axis is logarithmic.
+    draw: function that draws into axes, and returns the legend's title.
     """
     from matplotlib import rc_context
 
@@ -178,9 +185,11 @@ def draw_curves(
 ) -> list[Path]:
     """Draw a scene's test PSNR and 1 - SSIM against seconds of training; return the files, none if no run has a curve.
 
-    Each option set has a colour, and a line with a band for its seeds (`_draw_seeds`). Lines are of the views on which
-    all runs compare; if these are a subset, hollow points apart from them score all. With one option set, the training
-    views are drawn too, dashed. peers: curves of other programs, in grey.
+    Each option set has a colour, and a line with a band for its seeds (`_draw_seeds`). Lines show the views on which
+    all runs compare; if these are a subset, separate hollow points show the scores of all views. With one option set,
+    the training views are drawn too, dashed.
+
+    peers: curves of other programs, in grey.
     """
     runs = [run for run in runs if any(row["test_psnr"] is not None for row in run["curve"])]
     several = len({run["config"] for run in runs}) > 1
@@ -217,7 +226,8 @@ def _about_seeds(runs: Sequence[dict[str, Any]], subset: int | None) -> str:
 def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
     """Draw test PSNR against the number of Gaussians trained; return the file, none where the number is the same.
 
-    Sets whose names agree but for a number at their end, as adc-100k and adc-1M, are joined by a line for each seed.
+    Option sets whose names differ only in a number at the end, as adc-100k and adc-1M, are joined by a line for each
+    seed.
     """
     lines: dict[tuple[str, Any], list[Point]] = {}
     for run in runs:
@@ -259,7 +269,8 @@ def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
 def draw_cameras(folder: Path, scene: str, splits: Mapping[str, Sequence[Any]]) -> list[Path]:
     """Draw the cameras of each split from above; return the files.
 
-    splits: by their names, of test and of training cameras arrays (N, 4): two coordinates, and two of the optical axis.
+    splits: for each split by its name, arrays (N, 4) of test and of training cameras: two coordinates, and two of the
+        optical axis.
     """
     from matplotlib import rc_context
 
@@ -311,7 +322,7 @@ def _are_alike(curves: Sequence[Sequence[Row]]) -> bool:
 def _draw_seeds(
     axes: Axes, curves: Sequence[Sequence[Row]], value: Value, views: str, name: str, style: dict[str, Any]
 ) -> None:
-    """Draw the mean of curves that are alike, and a band from the lowest to the highest; a line for each of others."""
+    """Draw the mean of curves that are alike, with a band from the lowest to the highest; or else each curve."""
     lines = [_points(rows, value, views) for rows in curves]
     if _are_alike(curves) and len({*map(len, lines)}) == 1:
         columns = [[*zip(*points, strict=True)] for points in zip(*lines, strict=True)]

@@ -71,7 +71,7 @@ def training_seconds(model: Path, iteration: int) -> float | None:
 
 
 def training_joules(model: Path, iteration: int) -> float | None:
-    """Read the joules of the GPUs in those seconds; None if they are not known."""
+    """Read the joules of the GPUs in these seconds of training; None if they are not known."""
     return logged(model).get(iteration, {}).get("joules")
 
 
@@ -86,7 +86,7 @@ def logged(model: Path, warn: bool = False) -> dict[int, dict[str, Any]]:
 
 
 def trained_iterations(model: Path) -> list[int]:
-    """List the saved iterations of the training that the log tells of, ascending.
+    """List the saved iterations of the training that the log describes, ascending.
 
     Where the clock ends a training, an earlier one of the same options may have left a later iteration.
     """
@@ -95,6 +95,6 @@ def trained_iterations(model: Path) -> list[int]:
 
 
 def closing_lines(model: Path) -> list[str]:
-    """Read what train.py said at its end: costs of the curve, what it left out; none if it logged nothing."""
+    """Read the lines that train.py printed at its end: costs of the curve, what it left out; none without a log."""
     lines = next(reversed(logged(model).values()), {}).get("lines")
     return list(map(str, lines)) if isinstance(lines, list) else []

@@ -42,9 +42,13 @@ _QUALITY = 85
 def summarise_times(
     seconds: Sequence[float], sizes: Sequence[tuple[int, int]], gaussians: int, antialiasing: bool, device: torch.device
 ) -> dict[str, Any]:
-    """The content of TIMES, from `seconds` and `sizes` (width, height; pixels) of the views in the order of their PNGs.
+    """Return the content of TIMES.
 
-    fps: frames per second at the median. sizes: each size once. threads: those of the CPU, whatever the device.
+    seconds, sizes: seconds and (width, height) in pixels of the views, in the order of their PNGs. The result has each
+        size once.
+    gaussians: number of Gaussians.
+    device: device that rendered. The result's `fps` are frames per second at the median, and its `threads` those of the
+        CPU, whatever the device.
     """
     import torch
 
@@ -145,7 +149,10 @@ def error_image(truth: Image.Image, render: Image.Image) -> Image.Image:
 
 
 def error_map(method: Path, name: str) -> Path:
-    """The file of a view's error map. method: the folder `ours_N`."""
+    """Return the path of a view's error map.
+
+    method: the folder `ours_N`.
+    """
     return method / ERRORS / f"{Path(name).stem}.jpg"
 
 
@@ -158,7 +165,7 @@ def write_error_map(method: Path, name: str, truth: np.ndarray, render: np.ndarr
 
 
 def worst_views(model: Path, psnrs: Mapping[str, float | None]) -> list[dict[str, Any]]:
-    """The views of the lowest PSNR, worst first: PSNR, `file`, and `picture`, the name of the photo."""
+    """List the views of the lowest PSNR, worst first: PSNR, `file`, and `picture`, the name of the photo."""
     worst = sorted((value, name) for name, value in psnrs.items() if value is not None)[:WORST]
     picture_name = photo_namer(model)
     return [{"PSNR": value, "file": name, "picture": picture_name(name)} for value, name in worst]
@@ -198,7 +205,7 @@ def sheet(
 
 
 def _label_width(font: ImageFont.FreeTypeFont, label: str) -> int:
-    """Pixels from the left side of an image to the end of its label."""
+    """Return the pixels from the left side of an image to the end of its label."""
     return math.ceil(INSET + font.getlength(label) + STROKE) if label else 0
 
 
@@ -213,8 +220,9 @@ def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:
 class ComparedViews:
     """The test views that several runs scored, those of the lowest PSNR first: photos, renders and their errors.
 
-    runs: of one scene with the same ground truth, of each option set one; all are finished. Pixels that do not count
-    are white in the images and black in the error. UserError for damaged scores or images.
+    Pixels that do not count are white in the images and black in the error. UserError for damaged scores or images.
+
+    runs: finished runs of one scene with the same ground truth, one of each option set.
     """
 
     def __init__(self, runs: Sequence[dict[str, Any]], output: Path) -> None:
@@ -231,9 +239,9 @@ class ComparedViews:
         return pairs[0][0], [render for _, render in pairs]
 
     def table(self) -> dict[str, Any]:
-        """Scores of all views: `heads`, and `rows` of (text, path of an error map or None) by column.
+        """Return the scores of all views: `heads`, and `rows` of (text, path of an error map or None) by column.
 
-        PSNR of each option set, or of one set all its scores.
+        The columns are the PSNR of each option set, or all scores of a single one.
         """
         columns = [(run, scores, "PSNR") for run, scores in zip(self._runs, self._per_view, strict=True)]
         if len(columns) == 1:
@@ -251,9 +259,9 @@ class ComparedViews:
         return cells
 
     def shown(self, most: int) -> list[dict[str, Any]]:
-        """At most `most` views: the worst, and others evenly spread to the best.
+        """Return at most `most` views: the worst, and others evenly spread to the best.
 
-        Each has the `name` of its photo, `photo` as a JPEG, and `sets`: of each run `text`, `render` and `error`.
+        Each has the `name` of its photo, `photo` as a JPEG, and `sets`: `text`, `render` and `error` of each run.
         """
         places = np.unique(np.linspace(0, len(self.files) - 1, min(most, len(self.files))).round().astype(int))
         return [self._view(self.files[place]) for place in places]
@@ -266,7 +274,7 @@ class ComparedViews:
         return {"name": self._photo_name(file), "photo": _jpeg(photo), "sets": sets}
 
     def draw_worst(self, path: Path) -> None:
-        """Draw the worst views on a sheet; with one run, with their errors. UserError if there is none."""
+        """Draw the worst views on a sheet; those of a single run with their errors. UserError if there is no view."""
         if not self.files:
             raise UserError("no view has a PSNR of each option set")
         rows = []

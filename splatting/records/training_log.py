@@ -1,4 +1,4 @@
-"""Records of a training: train_log.json, by a clock of training; one for each tested or saved iteration."""
+"""Records of a training in train_log.json, by a clock of training; a record for each tested or saved iteration."""
 
 import math
 import os
@@ -20,12 +20,11 @@ _FINITE = (DEGREES, PERCENT, *_OTHERS)  # if present
 
 
 class Stopwatch:
-    """Seconds since its construction, without those inside `paused()` or of a stopped process, where it stands still.
+    """A clock of the seconds since its construction, stopped inside `paused()` and while the process is stopped.
 
-    counter: reads joules (host/energy.py), which are counted like the seconds, but also while the process is stopped.
-    It is read inside of pauses, so that it costs no seconds. None: no joules are known.
-
-    spent: the seconds inside, by their purpose. Of a pause in another one, they count for the inner purpose.
+    counter: function that reads joules (host/energy.py), which are counted like the seconds, but also while the process
+        is stopped. It is called inside of pauses, so that it costs no seconds. None: no joules are known.
+    spent: seconds inside of pauses, by their purpose. A pause inside another one counts for the inner purpose.
     """
 
     def __init__(self, counter: Callable[[], float] | None = None) -> None:
@@ -43,7 +42,7 @@ class Stopwatch:
 
     @property
     def joules(self) -> float | None:
-        """Joules in these seconds; None if they are not known."""
+        """Joules in the seconds of the clock; None if they are not known."""
         joules = (self._counter() if self._stopped is None else self._joules_stopped) - self._joules
         return None if math.isnan(joules) else joules
 
@@ -67,14 +66,20 @@ class Stopwatch:
 
 
 class TrainingLog:
-    """Records of one model folder, written whole after each addition.
+    """The records of a model folder, written whole after each addition. Entries of a record:
 
-    A record has `iteration`; `seconds` of training, without evaluation, saving and a stopped process; `wall_seconds`
-    since the process started; `joules` of all GPUs in the seconds of training, where known; `peak_memory_mib`, the most
-    so far; `gaussians`; `loss`, a running mean; and for each set tested `<set>_l1`, `<set>_psnr`. Seconds, joules and
-    memory include the runs that were resumed. The last record also has
-    `gaussians_left_out`, those that the last save does not have, the costs of the curve (curve_recorder.py), the
-    seconds of this process by what they were spent on (training/log.py), `strategy`, and `lines`, said at its end.
+    iteration: number of the iteration.
+    seconds: seconds of training, without evaluation, saving and a stopped process.
+    wall_seconds: seconds since the process started.
+    joules: joules of all GPUs in the seconds of training, where known.
+    peak_memory_mib: the most memory so far.
+    gaussians: number of Gaussians.
+    loss: a running mean.
+    `<set>_l1`, `<set>_psnr`: scores of each set tested.
+
+    Seconds, joules and memory include the runs that were resumed. The last record also has `gaussians_left_out` (those
+    that the last save does not have), the costs of the curve (curve_recorder.py), the seconds of this process by their
+    purpose (splatting/log.py), `strategy`, and `lines`, which were printed at the end.
 
     first_iteration, seconds_before, wall_seconds_before: done by the runs that this one resumes.
     """
@@ -84,7 +89,7 @@ class TrainingLog:
     ) -> None:
         """Keep the records of an existing log up to `first_iteration`, where a run resumes.
 
-        before: the folder of that log, unless it is model_path.
+        before: folder of that log, unless it is model_path.
         """
         self._path = Path(model_path) / NAME
         source = self._path if before is None else Path(before) / NAME
@@ -100,7 +105,7 @@ class TrainingLog:
         self._peak_before: float | None = last.get("peak_memory_mib")
 
     def not_before(self, row: dict[str, float | None]) -> None:
-        """Continue counting from a row of the earlier runs' curve if it is later than their log.
+        """Continue counting from a row of the earlier runs' curve, if it is later than the log of these runs.
 
         The row has no joules, so those of this training are not known then.
         """
@@ -111,18 +116,20 @@ class TrainingLog:
 
     @property
     def loss(self) -> float:
-        """Running mean of the last record, 0 if there is none."""
+        """The running mean of the last record, 0 if there is none."""
         return (self.records[-1].get("loss") if self.records else None) or 0.0
 
     def peak_memory_mib(self) -> float | None:
-        """Most memory held so far, by this run or those it resumes (host/memory.py); None if not known."""
+        """Return the most memory held so far, by this run or those it resumes (host/memory.py); None if not known."""
         peaks = [peak for peak in (self._peak_before, peak_memory_mib(compute_device())) if peak is not None]
         return round(max(peaks), 1) if peaks else None
 
     def add(self, iteration: int, seconds: float, joules: float | None = None, **values: float) -> None:
-        """Append a record, or add to that of the same iteration. seconds, joules: of this run.
+        """Append a record, or add to that of the same iteration.
 
         A value that is not finite (PSNR of equal images) becomes null.
+
+        seconds, joules: of this run.
         """
         record = {name: value if math.isfinite(value) else None for name, value in values.items()}
         record |= {
@@ -140,7 +147,7 @@ class TrainingLog:
         write_json(self._path, self.records)
 
     def note(self, **values: float | None) -> None:
-        """Add values to the last record as it is."""
+        """Add values to the last record, and change nothing else in it."""
         if self.records:
             self.records[-1] |= values
             write_json(self._path, self.records)
@@ -151,21 +158,21 @@ class TrainingLog:
         self.keep(*lines)
 
     def advise(self, *lines: str) -> None:
-        """`keep` what to try next; the first line of a training is printed, too."""
+        """Keep lines that say what to try next (`keep`), and print the first line of a training."""
         if lines and not self._advised:
             self._advised = True
             print(lines[0])
         self.keep(*lines)
 
     def keep(self, *lines: str) -> None:
-        """Add to `lines` of the last record, which reports show."""
+        """Add lines to `lines` of the last record, which reports show."""
         if self.records and lines:
             self.records[-1].setdefault("lines", []).extend(lines)
             write_json(self._path, self.records)
 
 
 def read_log(path: str | os.PathLike) -> list[dict]:
-    """Records of a log; none if there is no file. UserError if it is damaged."""
+    """Read the records of a log; none if there is no file. UserError if the file is damaged."""
     if not Path(path).is_file():
         return []
     try:
@@ -180,7 +187,7 @@ def read_log(path: str | os.PathLike) -> list[dict]:
 
 
 def _read(path: Path) -> list[dict]:
-    """Records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
+    """Read the records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
     try:
         return read_log(path)
     except UserError as error:
