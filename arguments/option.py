@@ -30,17 +30,21 @@ TOPICS = {
 class Option:
     """One command-line option.
 
-    name, short: long name (also the attribute) and one-letter form; default: its type is the option's type.
-    help: effect, may be empty. origin: source of the default; "ours..." for options that the reference does not have.
-    check: returns None for a valid value, else a description of valid values.
-    stored: the file of the model folder that keeps it; empty: none. compared: whether a resumed run warns if its value
-    is not the stored one.
-    after: the option of its group that it follows; empty: where its part has its place.
-    seen: whether renders of a model differ with its value, if no name of them tells it.
-    loaded: what a command that loads a model takes if the option is not given; empty: the stored value.
-    called: the default where a program calls `train.training`, if it is another one there.
-    topic: its group in train.py's help, one of TOPICS. unset: what the help shows as the default, if not the value.
-    above_zero: whether a typed 0, which would count as not given, is refused.
+    name: long name, which is also the attribute.
+    default: default value, whose type is the option's type.
+    help: effect, may be empty.
+    origin: source of the default; "ours..." for options that the reference does not have.
+    short: one-letter form.
+    check: function that returns None for a valid value, else a description of valid values.
+    stored: file of the model folder that keeps the value; empty: none.
+    compared: true if a resumed run warns of a value that is not the stored one.
+    after: option of the same group that this one follows; empty: the place of its part.
+    seen: true if renders of a model differ with the value, unless their names say so.
+    loaded: value for a command that loads a model, if the option is not given; empty: the stored value.
+    called: default where a program calls `train.training`, if that is another one.
+    topic: group of the option in train.py's help, one of TOPICS.
+    unset: default that the help shows, if not the value.
+    above_zero: true if a typed 0, which would count as not given, is refused.
     """
 
     name: str
@@ -61,7 +65,7 @@ class Option:
 
     @property
     def ours(self) -> bool:
-        """Whether the reference does not have this option."""
+        """True if the reference does not have this option."""
         return self.origin.startswith("ours")
 
     @property
@@ -85,7 +89,10 @@ class Option:
         return "off" if self.default is False else "none" if self.default == "" else str(self.default)
 
     def _shown_default(self, sentinel: bool) -> str:
-        """Text about what counts if the option is not given. sentinel: by a command that loads a model."""
+        """Return a text about the value that counts if the option is not given.
+
+        sentinel: true for a command that loads a model.
+        """
         if sentinel and (self.loaded or self.stored):
             return self.loaded or "that of the model"
         return self.unset or f"{self._shown()}; {self.origin}"
@@ -107,7 +114,7 @@ class Option:
 
 
 def in_places(options: Sequence[Option]) -> tuple[Option, ...]:
-    """The options, each that names another in `after` behind it."""
+    """Return the options in order: each one that names another in `after` comes behind it."""
     places = {option.name: (index, 0) for index, option in enumerate(options)}
     return tuple(sorted(options, key=lambda one: (*places[one.after][:1], 1) if one.after else places[one.name]))
 

@@ -131,7 +131,7 @@ class FusedAdam:
 
 
 class StepArguments(NamedTuple):
-    """What `apply_gradients_` takes for a step, in its order; lists have an entry for each attribute that steps."""
+    """The arguments of `apply_gradients_` for a step, in order; lists have an entry for each attribute that steps."""
 
     averages: list[Tensor]  # exp_avg of all, then exp_avg_sq
     steps: list[Tensor]  # counters

@@ -71,7 +71,7 @@ def extension_options(roots: dict[str, Path]) -> dict[str, Any]:
 class BuildModules(build_py):
     """Copies the packages' modules, after removing those that an earlier build of the same folder has left.
 
-    Each extension's package gets those that all share, since each stands alone.
+    Each extension's package gets a copy of the modules that all share, since each package stands alone.
     """
 
     def run(self) -> None:
@@ -85,7 +85,7 @@ class BuildModules(build_py):
 
 
 class Compilation(NamedTuple):
-    """A compiler's command without its input and output, and these."""
+    """A compiler's command without its input and output, which follow."""
 
     command: list[str]
     source: Path
@@ -121,7 +121,10 @@ class BuildBackends(build_ext):
 
 
 def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path, objects: Path) -> list[Compilation]:
-    """All that is compiled for one library. nvcc: None for a build without CUDA."""
+    """List all compilations of one library.
+
+    nvcc: path of nvcc; None for a build without CUDA.
+    """
     headers = Path(torch.__file__).parent / "include"
     # Messages name files without the folders of this machine, so that every machine builds the same bytes.
     places = [f"-ffile-prefix-map={folder}={name}" for folder, name in ((csrc.parents[1], "."), (headers, "torch"))]
@@ -165,7 +168,10 @@ def compilations(torch: ModuleType, cxx: list[str], nvcc: str | None, csrc: Path
 
 
 def find_sources(csrc: Path, folder: str, ending: str) -> list[Path]:
-    """Sources below folders of a name, at any depth, by their own names, which differ and which objects take."""
+    """List the sources below folders of a name, at any depth, sorted by file name.
+
+    File names differ, because objects are named after them.
+    """
     found = [path for path in csrc.rglob(f"*{ending}") if folder in path.relative_to(csrc).parts[:-1]]
     return sorted(found, key=lambda path: path.name)
 
@@ -198,12 +204,12 @@ def target_version(version: tuple[int, int]) -> str:
 
 
 def is_per_isa(source: Path) -> bool:
-    """Whether a source is compiled once per instruction set."""
+    """Tell whether a source is compiled once per instruction set."""
     return source.stem.endswith("_isa")
 
 
 def import_torch() -> ModuleType:
-    """torch, new enough; otherwise ends the build with one line."""
+    """Import torch; end the build with one line if torch is missing or too old."""
     try:
         import torch
     except ImportError:
@@ -214,9 +220,10 @@ def import_torch() -> ModuleType:
 
 
 def find_compiler() -> list[str]:
-    """The C++ compiler's command: CXX, else c++, g++ or clang++ on PATH.
+    """Return the C++ compiler's command: CXX, else c++, g++ or clang++ on PATH.
 
-    On Windows only LLVM's clang++: MSVC has no vectors like those of gs/simd.h, and GCC does not link with torch.
+    On Windows only LLVM's clang++ will do: MSVC has no vectors like those of gs/simd.h, and GCC does not link with
+    torch.
     """
     wanted = shlex.split(os.environ.get("CXX", ""))
     usual = [["clang++"]] if sys.platform == "win32" else [["c++"], ["g++"], ["clang++"]]

@@ -50,7 +50,7 @@ def _raising(packet: Any) -> Callable[..., Any]:
 
 @cache  # the query takes longer than the checks of a call
 def has_kernels(operator: str, device: str) -> bool:
-    """Whether this build has an operator for a type of devices, "cpu" or "cuda"."""
+    """Tell whether this build has an operator for a type of devices, "cpu" or "cuda"."""
     return torch._C._dispatch_has_kernel_for_dispatch_key(f"{_PACKAGE}::{operator}", device.upper())
 
 

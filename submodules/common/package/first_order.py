@@ -41,15 +41,16 @@ def direct_apply(function: type[Function], transformed: type[Function] | None = 
 
 
 def is_compiled() -> bool:
-    """Whether the call is part of a function of torch.compile, which takes operators and fails in Functions.
+    """Tell whether the call is part of a function of torch.compile, which takes operators and fails in Functions.
 
-    A break of the graph ends `is_compiling` for the rest of a function, but torch.compile still sees what that calls.
+    A break of the graph ends `is_compiling` for the rest of a function, but torch.compile still sees what the rest
+    calls.
     """
     return torch.compiler.is_compiling() or get_eval_frame_callback() is not None
 
 
 def needs_function(*inputs: Tensor | None) -> bool:
-    """Whether a call has to pass autograd's Function: for gradients, or to raise where inputs have tangents.
+    """Tell whether a call has to pass autograd's Function: for gradients, or to raise where inputs have tangents.
 
     An operator alone would drop the tangents of forward mode.
     """
@@ -59,7 +60,7 @@ def needs_function(*inputs: Tensor | None) -> bool:
 
 
 class _Final(Function):
-    """The first `count` of the tensors, as results that depend on all of them and have no derivative."""
+    """Makes the first `count` of the tensors results that depend on all of the tensors and have no derivative."""
 
     generate_vmap_rule = True
 
@@ -87,10 +88,10 @@ class _Unpacked:
 
 
 def first_order(name: str) -> Callable[[Callable[..., tuple]], Callable[..., tuple]]:
-    """Makes the decorator of a backward whose results raise RuntimeError, with the name, when they are differentiated.
+    """Make the decorator of a backward whose results raise RuntimeError, with the name, when they are differentiated.
 
-    torch's once_differentiable does so only where the incoming gradients need a derivative, and only on the way to
-    them. It would let a penalty on the gradient of a sum add nothing, and make a Hessian 0.
+    torch's once_differentiable raises only where the incoming gradients need a derivative, and only on the way to them.
+    It would let a penalty on the gradient of a sum add nothing, and make a Hessian 0.
     """
 
     def decorate(backward: Callable[..., tuple]) -> Callable[..., tuple]:

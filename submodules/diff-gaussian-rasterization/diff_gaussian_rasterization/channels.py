@@ -47,12 +47,14 @@ def rasterize_channels(
 ) -> ChannelImage:
     """Renders Gaussians with C channels: the colours, if there are any, then the features.
 
-    features (N, F): further channels, finite; or all of them, where neither colours nor SH are given. depths (N,): what
-    orders the Gaussians, in place of their depths in the view. any_rotation: rotations have any length, though others
-    are not raw. most_alpha: a larger alpha counts as this one, without a gradient; None: 0.99, where the gradient
-    passes. settings.bg: (C,) or (1,). Differentiable in all of these but depths. Other arguments and errors are those
-    of `rasterize`; absolute gradients need at most 32 channels. Gaussians on the rays of a lens have three channels
-    only: ValueError.
+    Differentiable in all tensors but depths. Other arguments and errors are those of `rasterize`; absolute gradients
+    need at most 32 channels. Gaussians on the rays of a lens have three channels only: ValueError.
+
+    features: (N, F), further channels, finite; or all channels, where neither colours nor SH are given.
+    depths: (N,), order of the Gaussians, in place of their depths in the view.
+    any_rotation: True if rotations have any length, though other parameters are not raw.
+    most_alpha: a larger alpha counts as this one, without a gradient; None: 0.99, where the gradient passes.
+    settings.bg: (C,) or (1,).
     """
     gaussians = Gaussians(means, opacities, **others)
     _check(gaussians._asdict() | {"features": features}, means2d, depths, settings)
@@ -96,7 +98,7 @@ def _check(
     depths: Tensor | None,
     settings: GaussianRasterizationSettings,
 ) -> None:
-    """What the operators that are called do not check, or without the names of the inputs."""
+    """Check inputs that the called operators do not check, or only without naming the inputs."""
     check_tensors(given | {"means2d": means2d, "depths": depths, "bg": settings.bg})
     means = given["means"]
     if means2d is not None and (means2d.shape != means.shape or means2d.dtype != means.dtype):

@@ -1,4 +1,4 @@
-"""Density control's computations besides its decisions. Nothing here is differentiable."""
+"""Computations of density control, without its decisions. Nothing here is differentiable."""
 
 import torch
 from torch import Tensor
@@ -86,5 +86,5 @@ def random_words(items: Tensor, *, seed: int, stream: int, iteration: int, draw:
 
 
 def _signed(seed: int) -> int:
-    """The lower 64 bits of a seed as the operators take them."""
+    """Return the lower 64 bits of a seed as the operators take them."""
     return (seed + 2**63) % 2**64 - 2**63

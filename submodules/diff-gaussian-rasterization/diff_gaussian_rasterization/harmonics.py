@@ -7,10 +7,13 @@ from torch import Tensor
 
 
 def sh_basis(degree: int, directions: Tensor) -> Tensor:
-    """The functions of all bands up to a degree, (N, (degree + 1)^2), of unit vectors (N, 3); differentiable.
+    """Return the functions of all bands up to a degree, (N, (degree + 1)^2), at unit vectors; differentiable.
 
-    Orders of a band go from -l to l, with the Condon-Shortley phase, as 3DGS has them. By recurrences of the associated
-    Legendre functions without their powers of the sine (Sloan 2008, Stupid Spherical Harmonics Tricks, appendix A1).
+    Orders of a band go from -l to l, with the Condon-Shortley phase, as 3DGS has them. The method is that of
+    recurrences of the associated Legendre functions without their powers of the sine (Sloan 2008, Stupid Spherical
+    Harmonics Tricks, appendix A1).
+
+    directions: (N, 3), unit vectors.
     """
     x, y, z = directions.unbind(-1)
     real, imaginary = [torch.ones_like(x)], [torch.zeros_like(x)]  # of (x + i y)^m
@@ -32,6 +35,10 @@ def sh_basis(degree: int, directions: Tensor) -> Tensor:
 
 
 def sh_values(degree: int, coefficients: Tensor, directions: Tensor) -> Tensor:
-    """What SH (N, K, D) of K >= (degree + 1)^2 bands are in directions (N, 3) of any length, (N, D)."""
+    """Return the values of SH in directions, (N, D).
+
+    coefficients: (N, K, D) of K >= (degree + 1)^2 bands.
+    directions: (N, 3), of any length.
+    """
     basis = sh_basis(degree, torch.nn.functional.normalize(directions, dim=-1))
     return torch.einsum("nk,nkd->nd", basis, coefficients[:, : basis.shape[1]])

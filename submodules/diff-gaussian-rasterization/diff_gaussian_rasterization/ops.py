@@ -121,7 +121,7 @@ def mark_visible(positions: Tensor, view: Tensor) -> Tensor:
 
 
 def has_cuda_kernels() -> bool:
-    """Whether this build has the CUDA backend. A GPU may be missing all the same: see torch.cuda.is_available()."""
+    """Tell whether this build has the CUDA backend. A GPU may be missing even so: see torch.cuda.is_available()."""
     return has_kernels("rasterize", "cuda")
 
 
@@ -191,7 +191,7 @@ library.register_autograd("diff_gaussian_rasterization::rasterize", _backward, s
 
 @library.register_vmap("diff_gaussian_rasterization::rasterize_vjp")
 def _vjp_of_each(info, in_dims, *arguments):
-    """torch's own rule does not know lists of tensors."""
+    """Compute item by item, because torch's own rule does not know lists of tensors."""
     flat, form = tree_flatten(arguments)
     dims = tree_leaves(in_dims)
     found = []
@@ -202,7 +202,7 @@ def _vjp_of_each(info, in_dims, *arguments):
 
 
 class _Rasterize(torch.autograd.Function):
-    """The same, with no more outputs than callers see."""
+    """The operator `rasterize` with no more outputs than callers see."""
 
     @staticmethod
     def forward(ctx, *inputs):

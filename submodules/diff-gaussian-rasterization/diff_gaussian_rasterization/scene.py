@@ -1,4 +1,4 @@
-"""Arguments and results of the operators: Gaussians with a camera, and what a forward makes of them."""
+"""Arguments and results of the operators: Gaussians with a camera, and the results of a forward."""
 
 import math
 from typing import NamedTuple
@@ -48,7 +48,7 @@ class Scene(NamedTuple):
 
     @property
     def camera(self) -> tuple:
-        """The other fields."""
+        """The fields after those of `Gaussians`."""
         return self[8:]
 
     @property
@@ -58,7 +58,7 @@ class Scene(NamedTuple):
 
     @property
     def lists(self) -> tuple:
-        """The same for an operator that takes lists of tensors, none of them None."""
+        """All fields, for an operator that takes lists of tensors, none of them None."""
         return [_NONE if t is None else t for t in self[:8]], self[8:11], self.lens, self.options
 
 
@@ -79,7 +79,7 @@ class Drawing(NamedTuple):
     layers: Tensor  # (V,), on a GPU
 
     def kept(self, background: Tensor) -> tuple[Tensor, ...]:
-        """What the operators of the backward take as `source` (Kept in csrc/torch/backward.h)."""
+        """Return the tensors that the operators of the backward take as `source` (Kept in csrc/torch/backward.h)."""
         return *self[4:], background, self[1]
 
 
@@ -133,9 +133,9 @@ def camera_arguments(
     antialiasing: bool | None,
     raw: int,
 ) -> tuple:
-    """The fields of `Scene.camera`, from what the reference takes.
+    """Return the fields of `Scene.camera`, from arguments in any form that the reference takes.
 
-    That is also further axes of length 1, whole floats, and a degree above 3, of which it draws 3.
+    The reference also takes further axes of length 1, whole floats, and a degree above 3, of which it draws 3.
     """
     size = [int(n) if isinstance(n, float) and n.is_integer() else n for n in (height, width)]
     options = (*size, min(degree, MOST_DEGREE), bool(antialiasing), raw)
@@ -145,6 +145,10 @@ def camera_arguments(
 def draw(
     scene: Scene, background: Tensor, want_inverse_depth: bool = False, train: bool = True, awake: Tensor | None = None
 ) -> Drawing:
-    """Call the operator `rasterize`. train: a backward will follow. awake: of `wake_`, whose sleepers are left out."""
+    """Call the operator `rasterize`.
+
+    train: True if a backward will follow.
+    awake: result of `wake_`, whose sleepers are left out.
+    """
     options = want_inverse_depth, train, False, awake
     return Drawing(*OPERATORS.rasterize(None, *scene, shaped(background, 3), *options))

@@ -1,9 +1,9 @@
-"""An image of channels in two stages, each a function of autograd: projection and blending.
+"""Blending in two stages, each a function of autograd: projection, then an image of channels.
 
 The gradient of `splats` is moments (csrc/math/footprint.h) in place of gradients of their values, from which projection
 makes gradients without loss. A third stage may describe splats in between, as that of gsplat's function does. Then
-blending sends it the moments, and beside them the same as gradients of means, conics and opacities, so that hooks see
-them.
+blending sends the moments to that stage, and beside them the gradients of means, conics and opacities, so that hooks
+see them.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,7 +21,7 @@ _ROW_Z, _SHIFT_Z = slice(6, 9), 11  # of the camera's numbers (camera.py)
 
 
 class Blending(NamedTuple):
-    """How alphas are blended, and what else is wanted."""
+    """Options of the blending of alphas, and further results that are wanted."""
 
     size: tuple[int, int]  # height, width
     cap: float  # the largest alpha
@@ -32,7 +32,7 @@ class Blending(NamedTuple):
 
 
 class Shared:
-    """What an image's stages tell each other during a backward pass."""
+    """Messages that an image's stages exchange during a backward pass."""
 
     __slots__ = ("describe_moments", "hooks", "lengths", "moments", "sent", "shown", "task", "use_lengths")
 
@@ -46,12 +46,12 @@ class Shared:
         self.task = self.moments = self.sent = None
 
     def send(self, moments: Tensor, gradients: Sequence[Tensor]) -> None:
-        """Keep what the description will get, to recognise it."""
+        """Keep moments and gradients, by which the stage that gets them recognises them."""
         self.task, self.moments = torch._C._current_graph_task_id(), moments
         self.sent = [(values.data_ptr(), values._version) for values in gradients]
 
     def take(self) -> tuple[Tensor | None, list]:
-        """What was sent in this pass: its moments, and the marks of its gradients."""
+        """Return what was sent in this pass: the moments, and the marks of the gradients."""
         now = self.task is not None and self.task == torch._C._current_graph_task_id()
         found = (self.moments, self.sent) if now else (None, [])
         self.task = self.moments = self.sent = None
@@ -59,8 +59,9 @@ class Shared:
 
 
 class _Projected(Function):
-    """Inputs: `Shared`, whether a backward follows, or None for no lists, the camera's numbers, means2d, `Scene`'s.
+    """The first stage: projects Gaussians, and makes their lists.
 
+    Inputs: `Shared`, True if a backward follows (None: no lists), the camera's numbers, means2d, the fields of `Scene`.
     Results: splats, depths, tile_counts, radii, then the lists of the operator `bin`, or the rects that it takes.
     """
 
@@ -111,10 +112,14 @@ class _Projected(Function):
 
 
 class _Blended(Function):
-    """Inputs: `Shared`, `Blending`, whether a backward follows, order (N,), the lists or rects, tile_counts, rows that
-    are shown or None, splats, then means2d, conics, opacities and depths as described, or None, features (N, F) or
-    None, and the background. Channels: colours, features, then depths, if they are described; they are blended as
-    `order` has them. Results: image and transmittance or alpha, and the lists: instances and ranges.
+    """The second stage: blends splats into an image.
+
+    Channels are colours, features, then depths, if they are described. They are blended in the order of `order`.
+
+    Inputs: `Shared`, `Blending`, True if a backward follows, order (N,), the lists or rects, tile_counts, rows that are
+        shown or None, splats, then means2d, conics, opacities and depths as described, or None, features (N, F) or
+        None, and the background.
+    Results: image and transmittance or alpha, and the lists: instances and ranges.
     """
 
     @staticmethod

@@ -92,7 +92,7 @@ def check_images(img1: Tensor, img2: Tensor, padding: str) -> None:
 
 
 def has_backend(device: str) -> bool:
-    """Whether this build computes on devices of a type, "cpu" or "cuda"."""
+    """Tell whether this build computes on devices of a type, "cpu" or "cuda"."""
     return has_kernels("l1_ssim", device)
 
 

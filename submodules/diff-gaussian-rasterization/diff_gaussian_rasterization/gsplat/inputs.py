@@ -30,7 +30,7 @@ _OTHERS = ("quats", "scales", "opacities", "colors", "Ks", "backgrounds", "covar
 
 
 class Call(NamedTuple):
-    """What all images of a call share."""
+    """The arguments that all images of a call share."""
 
     size: tuple[int, int]  # height, width
     degree: int | None  # of SH
@@ -65,7 +65,10 @@ class Item(NamedTuple):
 
 
 def checked(given: dict[str, Any]) -> tuple[Call, Tensor | None, int]:
-    """The arguments of `rasterization`, backgrounds and tile_size apart. ValueError, or TypeError, for wrong ones."""
+    """Check the arguments of `rasterization`. Return the call, the backgrounds and tile_size.
+
+    ValueError, or TypeError, for wrong arguments.
+    """
     for name, remedy in _UNSUPPORTED.items():
         if given[name] is not None and given[name] is not False:
             raise ValueError(f"{name} is not supported; {remedy}")
@@ -104,7 +107,7 @@ def checked(given: dict[str, Any]) -> tuple[Call, Tensor | None, int]:
 
 
 def _check_renderer(config: Any) -> None:
-    """gsplat's classes, by their names: only its default is one for images without rays."""
+    """Refuse renderer classes of gsplat, by their names, except its default: only that one has images without rays."""
     name = type(config).__name__
     if config is None or name == "RendererConfig_MixedBatch":
         return
@@ -116,7 +119,7 @@ def _check_renderer(config: Any) -> None:
 
 
 def items_of(call: Call, given: Item, form: tuple[int, ...]) -> list[Item]:
-    """The images. ValueError for tensors of wrong shapes or dtypes."""
+    """Split the arguments into images. ValueError for tensors of wrong shapes or dtypes."""
     if not all(form):
         raise ValueError(f"there must be an image to render, got batches and cameras {form}")
     if given.covars is not None:
@@ -138,7 +141,12 @@ def items_of(call: Call, given: Item, form: tuple[int, ...]) -> list[Item]:
 
 
 def _part(values: Tensor | None, batch: int, axes: int, place: int) -> Tensor | None:
-    """What a batch has of values with so many leading axes; all, where they are not of batches."""
+    """Return the values of one batch; all values, where they have no axes of batches.
+
+    batch: number of leading axes of batches.
+    axes: number of axes without them.
+    place: index of the batch.
+    """
     if values is None or not batch or values.dim() == axes:
         return values
     return values.flatten(0, batch - 1)[place]

@@ -64,7 +64,7 @@ def numbers_of(lens: Lens, places: Tensor, width: int, height: int) -> Tensor:
 
 
 def _distorted(lens: Lens, numbers: Tensor) -> Tensor:
-    """Brown 1966 and Weng et al. 1992, on numbers (..., 2) of the chart."""
+    """Distort numbers (..., 2) of the chart, by Brown 1966 and Weng et al. 1992."""
     a, b = numbers.unbind(-1)
     q, (p1, p2) = a * a + b * b, lens.tangential
     over, under = (1 + sum(c * q ** (k + 1) for k, c in enumerate(terms)) for terms in (lens.radial, lens.divisor))
@@ -74,7 +74,7 @@ def _distorted(lens: Lens, numbers: Tensor) -> Tensor:
 
 
 def _directions(lens: Lens, numbers: Tensor) -> Tensor:
-    """Directions (N, 3) that a chart gives numbers (N, 2); 0 for numbers of none."""
+    """Return the directions (N, 3) of a chart's numbers (N, 2); 0 for numbers without a direction."""
     a, b = numbers.unbind(1)
     if lens.chart == "perspective":
         return torch.stack([a, b, torch.ones_like(a)], 1)

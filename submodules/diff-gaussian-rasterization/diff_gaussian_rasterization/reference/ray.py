@@ -22,7 +22,7 @@ from diff_gaussian_rasterization.reference.shape import Ellipses, ellipses_of, i
 
 
 class Slopes(NamedTuple):
-    """What rays need of N Gaussians besides their ellipses."""
+    """Further values of N Gaussians that rays need besides their ellipses."""
 
     g: Tensor  # (N, 2) per px
     e: Tensor  # (N,) squared deviation along the ray, over the squared depth
@@ -30,7 +30,7 @@ class Slopes(NamedTuple):
 
 
 def ray_shapes(gaussians: Gaussians, points: Points, camera: Camera, scale_modifier: float) -> tuple[Ellipses, Slopes]:
-    """The ellipses of C, and the slopes."""
+    """Return the ellipses of the covariances C, and the slopes."""
     J, depth = jacobians(points, camera), points.depth[:, None]
     if camera.lens is None or camera.lens.chart == "perspective":
         by_depth = torch.tensor([0.0, 0, 1], dtype=torch.float64).expand(len(depth), 3)
