@@ -37,7 +37,7 @@ _kept: list[subprocess.Popen] = []
 
 
 class Done(NamedTuple):
-    """How a program has ended, and what it printed."""
+    """The end of a program, and its output."""
 
     status: int
     stdout: str

@@ -40,7 +40,7 @@ def cmyk_profile() -> bytes:
 
 
 def to_srgb(colors: np.ndarray, name: str) -> np.ndarray:
-    """What colours (..., 3) of 0 to 1 in a space are in sRGB, clipped: the formulas, without any library."""
+    """Convert colours (..., 3) of 0 to 1 from a space to sRGB, clipped: by the formulas, without any library."""
     gamma = _GAMMA[name]
     linear = colors**gamma if gamma else np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     other = np.clip(linear @ np.transpose(_XYZ[name]) @ np.linalg.inv(np.transpose(_XYZ["sRGB"])), 0, 1)

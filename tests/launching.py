@@ -16,7 +16,10 @@ OPTIONS = ("--iterations", "12", "--checkpoint_iterations", "5", "--save_iterati
 
 
 class Launched(NamedTuple):
-    """How a training of several ranks has ended. Outputs: of all ranks and restarts, by rank."""
+    """The end of a training of several ranks.
+
+    stdout, stderr: outputs of all ranks and restarts, by rank.
+    """
 
     status: int
     stdout: list[str]

@@ -44,7 +44,10 @@ def colmap_camera(lens: Lens):
 
 
 def opencv_pixels(lens: NativeLens, points: np.ndarray) -> np.ndarray:
-    """Where a lens of the rasterizer shows points (N,3) of the camera, by OpenCV's formulas: (N,2), centres at .5."""
+    """Project points of the camera by a lens of the rasterizer, with OpenCV's formulas. Return (N, 2), centres at .5.
+
+    points: (N, 3).
+    """
     across = points[:, :2] / points[:, 2:]
     radius = np.linalg.norm(across, axis=1, keepdims=True)
     if lens.chart == "equidistant":

@@ -1,6 +1,6 @@
-"""What the operators of density control compute, written in torch: exp, log, cos and sin in float64, and Philox.
+"""Formulas of density control's operators, in torch: exp, log, cos and sin in float64, and Philox.
 
-Only operations that IEEE 754 rounds in one way, in the operators' order, so that the bits are the same.
+Only operations that IEEE 754 rounds in one way are used, in the operators' order, so that the bits are the same.
 """
 
 import math

@@ -155,7 +155,7 @@ PROGRAMS = {"train": train, "render": render, "metrics": metrics, "export": expo
 
 
 def run(command: list[str], say: str = "", slot: Slot | None = None, **environment: str) -> Finished:
-    """What `run_child` returns for such a program. An exit of 130 counts as an interrupt of full_eval.py, too."""
+    """Return the result of `run_child` for a stand-in. An exit of 130 also counts as an interrupt of full_eval.py."""
     start = time.perf_counter()
     if say and not slot:
         print(f"  {say}")
@@ -175,7 +175,7 @@ def run_as_programs(command: list[str], say: str = "", slot: Slot | None = None,
 
 
 def run_here(command: list[str], say: str = "", slot: Slot | None = None, **environment: str) -> Finished:
-    """What `run_child` returns for a real program that ends without an error; any other error is raised."""
+    """Return the result of `run_child` for a real program that ends without an error; any other error is raised."""
     start = time.perf_counter()
     stdout = mock.patch.object(sys, "stdout", sys.stdout)  # training stamps it
     with stdout, mock.patch.object(sys, "argv", command[1:]), mock.patch.dict(os.environ, environment):

@@ -34,7 +34,7 @@ def until(holds: Callable[[], bool], what: str) -> None:
 
 
 def picture(tab: "Page") -> np.ndarray:
-    """What a tab shows, (height, width, 3) in 0 to 255."""
+    """Return the picture of a tab, (height, width, 3) in 0 to 255."""
     return np.asarray(Image.open(io.BytesIO(tab.screenshot())).convert("RGB"), np.float64)
 
 
@@ -62,5 +62,5 @@ def expected(splats: "Splats", camera: "MiniCam") -> np.ndarray:
 
 
 def psnr(one: np.ndarray, other: np.ndarray) -> float:
-    """Of two pictures, dB."""
+    """Return the PSNR of two pictures, dB."""
     return 10 * math.log10(255**2 / np.square(one - other).mean())

@@ -1,4 +1,4 @@
-"""Whether a model is right, judged by the pairs it was made from; and in which ways photos are mapped."""
+"""Agreement of a model with the pairs that it was made from, and the ways in which photos are mapped."""
 
 import json
 from functools import partial

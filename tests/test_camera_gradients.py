@@ -61,7 +61,7 @@ def test_all_of_a_pinhole(view, degree, antialiasing):
 
 
 def _gradient_of_numbers(parameters: dict[str, Tensor], camera) -> Tensor:
-    """Of a sum of all colours, by the operators."""
+    """Return the gradient of a sum of all colours by the camera's numbers, by the operators."""
     scene = scene_arguments(Gaussians(**parameters), camera, True)
     drawn = draw(scene, camera.bg)
     source = drawn.kept(camera.bg)

@@ -91,7 +91,7 @@ def test_matrices_are_the_formulas_transposed():
 
 
 def test_what_is_read_follows_the_place():
-    """It is made where it is first read, even if somebody has assigned R then, or renders in inference mode."""
+    """A matrix is made where it is first read, even if somebody has assigned R before, or renders in inference mode."""
     camera, other = _camera(_info()), _info(R=np.eye(3), T=np.array([1.0, 2.0, 3.0]))
     wanted = _camera(other)
     names = ("world_view_transform", "full_proj_transform", "camera_center", "projection_matrix")

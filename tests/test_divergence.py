@@ -113,7 +113,7 @@ def _nan_loss_in(monkeypatch: pytest.MonkeyPatch, iteration: int) -> None:
     ("broken", "optimizer"), [(3, "default"), (13, "sparse_adam"), (26, "default"), (12, "default")]
 )
 def test_the_model_before_a_loss_of_nan_is_saved(colmap_scene, tmp_path, monkeypatch, broken, optimizer):
-    """Whether divergence is detected at once, on a save (3) or a change (13, 26), or later, nothing has moved since."""
+    """Nothing moves after divergence, detected at once, on a save (3), on a change (13, 26), or later."""
     options = ["--densify_from_iter", 10, "--densification_interval", 13, "--densify_grad_threshold", 1e-4]
     options += ["--opacity_reset_interval", 26, "--optimizer_type", optimizer]
     monkeypatch.setattr("splatting.run.USUAL", 1)  # else bands follow the number of iterations

@@ -86,7 +86,7 @@ def _flags(program: str) -> frozenset[str]:
 
 
 def _help(program: str, word: str) -> str:
-    """What the program prints with one word. In this process, as importing torch takes seconds."""
+    """Return the output of the program with one word. It runs in this process, as importing torch takes seconds."""
     said, argv, path = io.StringIO(), sys.argv, sys.path.copy()
     sys.argv = [program, word]
     try:

@@ -77,7 +77,7 @@ def test_differences_name_what_and_whose():
 
 
 class _Asked(_Second):
-    """Of two ranks the one that was asked for something else."""
+    """The second of two ranks, which was asked for something else."""
 
     def all_gather_objects(self, value: dict[str, str]) -> list[dict[str, str]]:
         return [{name: "1" if name == "--seed" else found for name, found in value.items()}, value]

@@ -15,7 +15,7 @@ from splatting.records.training_log import Stopwatch, TrainingLog
 
 
 class NvmlError(Exception):
-    """What NVML raises."""
+    """The error that NVML raises."""
 
 
 @pytest.fixture

@@ -135,7 +135,7 @@ class TestFile:
     ],
 )
 def test_a_short_training_scores_with_its_end_within_five_percent(tmp_path, iterations, views, points, sets):
-    """Where need be, points between score no training views; where there are few test views, all of these."""
+    """If need be, points between score no training views; where there are few test views, they score all of these."""
     recorder, seen = _recorder(tmp_path, iterations, [-1], {name: [20.0] * views for name in ("test", "train")})
     for iteration in range(1, iterations + 1):
         if recorder.due(range(iteration, iteration + 1), 0, iteration / 10):

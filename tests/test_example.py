@@ -83,7 +83,7 @@ def test_a_strategy_with_a_value_for_each_gaussian(colmap_scene, tmp_path):
 
 @pytest.mark.slow
 def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
-    """As the guide has them made: a file, an entry of options and a line each."""
+    """The copies are made as the guide says: a file, an entry of options and a line each."""
     for path in (*ROOT.glob("*.py"), ROOT / "pyproject.toml", ROOT / "version.txt"):
         shutil.copy(path, tmp_path)
     for room in (

@@ -79,7 +79,7 @@ def _outputs(book: nbformat.NotebookNode) -> list[nbformat.NotebookNode]:
 
 
 def _displayed(book: nbformat.NotebookNode, kind: str) -> list[str]:
-    """What the cells displayed of one MIME type."""
+    """Return the outputs of the cells of one MIME type."""
     return [output.data[kind] for output in _outputs(book) if kind in output.get("data", {})]
 
 

@@ -105,7 +105,7 @@ def test_training_starts_from_the_gaussians_of_a_file(tmp_path, colmap_scene, en
 
 
 def _checkpoint(path: Path, some: Splats, kind: str) -> Path:
-    """What a program's trainer saves of splats."""
+    """Write splats in the form that another program's trainer saves."""
     values = {name: torch.from_numpy(x) for name, x in vars(some).items() if isinstance(x, np.ndarray)}
     sh, logits = values["sh"], values["opacity_logits"]
     named = {"means": values["means"], "scales": values["log_scales"], "quats": values["rotations"]}

@@ -263,7 +263,7 @@ def test_scales_of_0_are_tiny_however_they_are_loaded(tmp_path, capsys):
 
 
 def test_bands_that_the_file_lacks_are_zero(tmp_path):
-    """As the last save writes it of a model whose bands are zero: a program that wants degree 3 gets the same model."""
+    """The last save leaves out bands that are zero: a program that wants degree 3 gets the same model."""
     for degree in (0, 1, 2):
         gaussians = model(5, degree=degree)
         gaussians.save_ply(tmp_path / "low.ply")

@@ -24,7 +24,7 @@ RATES = [1e-4, 0.05, 0.005, 0.001, 0.0025, 0.000125]
 
 @dataclass
 class State:
-    """What a step changes: values and averages by attribute, counters, statistics, the guard's flag."""
+    """The state that a step changes: values and averages by attribute, counters, statistics, the guard's flag."""
 
     values: dict[str, Tensor]
     averages: list[list[Tensor]] = field(default_factory=list)
@@ -52,7 +52,11 @@ class State:
 
 @dataclass
 class Case:
-    """How a step is taken. attributes: those that take one; columns: of sh_rest."""
+    """A way to take a step.
+
+    attributes: attributes that take one.
+    columns: columns of sh_rest.
+    """
 
     sparse: bool = False
     guarded: bool = False

@@ -57,7 +57,7 @@ class Forward:
         return (instances, ranges, *slots), blended
 
     def kept(self, lists: tuple[Tensor, ...], blended: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        """What a forward keeps for its backward."""
+        """Return the tensors that a forward keeps for its backward."""
         splats, _, _, tile_counts, radii = self.projected
         *planes, last, layers = blended
         return Drawing(*planes, radii, splats, tile_counts, *lists, last, layers).kept(self.background)

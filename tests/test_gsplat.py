@@ -375,7 +375,7 @@ def test_means2d_gets_its_gradient_in_pixels(packed):
 
 @CPU_AND_GPU
 def test_radii_tell_whether_a_box_around_the_mean_meets_the_image(device):
-    """As in gsplat, whose strategies count views by them. Whether it reaches the centre of a pixel does not matter."""
+    """The strategies of gsplat count views by radii. It does not matter if a Gaussian reaches the centre of a pixel."""
     given = Inputs(4, count=4000)
     with torch.no_grad():
         given.means *= 2

@@ -95,7 +95,7 @@ def _is_module(name: str) -> bool:
 
 
 def _for_types(tree: ast.Module) -> set[ast.AST]:
-    """What stands under `if TYPE_CHECKING:`, which no program runs."""
+    """Return the nodes under `if TYPE_CHECKING:`, which no program runs."""
     tests = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
     return {inner for node in tests for part in node.body for inner in ast.walk(part)}
 

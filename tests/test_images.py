@@ -334,7 +334,7 @@ def test_photos_for_colmap_are_srgb_and_others_are_linked(tmp_path, capsys, name
 
 
 def test_photos_that_colmap_undistorts_where_they_lie_keep_their_profile(colmap_scene, tmp_path):
-    """As by --skip_matching, which prepares no photos. What is written is read right."""
+    """Photos are not prepared, as with --skip_matching. The written files are read with the right colours."""
     photos = [path for path in (colmap_scene / "images").rglob("*") if path.is_file()]
     for path in photos:
         with Image.open(path) as image:

@@ -206,7 +206,7 @@ def test_masks_of_frames(scene):
 
 @pytest.mark.parametrize("native", [False, True])
 def test_the_circle_of_a_fisheye_is_a_mask(scene, native, capsys):
-    """Of each photo, also beside a mask of its own, whose black half stays masked. Who reads poses alone says so."""
+    """Each photo gets the circle, also beside its own mask, whose black half stays masked. Readers of poses say so."""
     grey = np.full((64, 96), 255, np.uint8)
     grey[:, :48] = 0
     Image.fromarray(grey).save(scene / "mask.png")

@@ -51,7 +51,10 @@ def make(tmp_path, once):
 
 
 def _pixels(view: CameraInfo, points: np.ndarray) -> np.ndarray:
-    """Where a view shows points (N,3): pixels (N,2), centres at .5."""
+    """Return the pixels (N, 2) of points in a view, centres at .5.
+
+    points: (N, 3).
+    """
     local = points @ view.R + view.T
     if view.native is not None:
         return opencv_pixels(view.native, local)

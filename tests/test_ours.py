@@ -97,7 +97,7 @@ def test_few_functions_run_or_delete_anything_and_each_has_a_reason():
 
 
 def test_pictures_are_opened_in_one_place():
-    """Which knows the formats that Pillow decodes itself: PostScript it hands to another program."""
+    """That place knows the formats that Pillow decodes itself. Pillow passes PostScript to another program."""
     for path in _python():
         if path.relative_to(ROOT).parts[0] != "benchmarks" and path.name != "image_files.py":
             assert "Image.open(" not in path.read_text(encoding="utf-8"), path

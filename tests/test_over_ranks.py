@@ -101,7 +101,7 @@ def test_ranks_render_the_image_and_the_gradients_of_one_process(size):
 
 
 def _decisive() -> list[Tensor]:
-    """Of this rank's Gaussians, by case."""
+    """Return which of this rank's Gaussians are decisive, by case."""
     here, found = ranks(), []
     for width, height, options in CASES:
         parameters, count = _scene(width, height, options), options.get("count", 300)

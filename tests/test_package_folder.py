@@ -63,7 +63,7 @@ def run(script: str, path: list[Path], folder: Path) -> str:
 
 @pytest.mark.slow
 def test_a_package_folder_works_beside_the_plain_names(tmp_path):
-    """As projects do that keep the code in a sub-folder and have both on the path of imports."""
+    """Some projects keep the code in a sub-folder and have both folders on the path of imports."""
     package = tmp_path / "project" / "gaussian_splatting"
     for room in ROOMS:
         shutil.copytree(ROOT / room, package / room, ignore=shutil.ignore_patterns("__pycache__"))

@@ -109,14 +109,14 @@ def test_nobody_names_a_part_outside_of_its_files(name):
 
 
 def test_options_import_nothing_heavy_and_no_part():
-    """As doctor.py reads them where torch is missing."""
+    """doctor.py reads options where torch is missing."""
     code = "import sys, arguments.launch; print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert not {"torch", "numpy", "scene", "splatting"} & {*done.stdout.split()}
 
 
 def test_parts_import_no_options_which_another_package_may_hide():
-    """As where other people's code with a package `arguments` of its own calls `Scene`."""
+    """Other people's code with a package `arguments` of its own calls `Scene`."""
     done = fork("import sys; sys.modules['arguments'] = None; import splatting.registry")
     assert done.status == 0, done.stderr
 

@@ -34,7 +34,7 @@ def test_gradients_are_autograds(count, device, dtype):
 @pytest.mark.parametrize("replaced", [False, True])
 @pytest.mark.parametrize("given", [False, True])
 def test_a_models_penalty_is_of_its_means(given, replaced):
-    """Of all Gaussians, whatever their activations and with or without gradients of the image."""
+    """The penalty counts all Gaussians, whatever their activations, with or without gradients of the image."""
     gaussians = model(30)
     if replaced:
         gaussians.opacity_activation = lambda x: x.sigmoid()

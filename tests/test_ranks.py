@@ -120,7 +120,7 @@ assert not any("gloo" in name for name in threads())
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the names of threads are read from /proc")
 def test_no_thread_of_a_group_is_left_behind():
-    """It would end with Python, whose lock it may wait for, and abort the process."""
+    """Such a thread would end with Python, whose lock it may wait for, and abort the process."""
     done = fork(_LEAVE)
     assert done.status == 0, done.stderr
 

@@ -186,7 +186,7 @@ def test_strided_inputs_give_the_same_bits():
 
 
 def test_the_band_of_degree_0_may_come_apart():
-    """As callers of the accelerated branch pass it: dc and the rest by keyword."""
+    """Callers of the accelerated branch pass dc and the rest by keyword."""
     splats, camera = scene()
     whole, apart = leaves(splats), leaves(splats)
     images = [call(whole, camera)[0], call(apart, camera, dc=apart["sh_dc"], shs=apart["sh_rest"])[0]]

@@ -42,7 +42,7 @@ def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
     ],
 )
 def test_more_instances_than_an_index_holds_are_an_error(counts, named):
-    """It is refused before allocating: 6.4 billion instances would be 50 GB. The message names the largest splats."""
+    """The call is refused before allocating: 6.4 billion instances would be 50 GB. It names the largest splats."""
     raw, size = few(dtype=torch.float32)
     splats, depths, rects, _, _ = ops.project(*scene_arguments(raw, settings(**size)))
     faked = torch.tensor(counts, dtype=torch.int32)
@@ -54,7 +54,7 @@ def test_more_instances_than_an_index_holds_are_an_error(counts, named):
 
 
 def test_an_image_of_more_tiles_than_an_index_holds_is_an_error():
-    """It is refused at once, since counting the tiles of a giant splat would take hours."""
+    """The call is refused at once, since counting the tiles of a giant splat would take hours."""
     raw, size = few(dtype=torch.float32)
     camera = settings(**size)._replace(image_width=2**23, image_height=2**23)
     with pytest.raises(RuntimeError, match=r"image size 8388608x8388608 has more than 2\^31 - 1 tiles"):

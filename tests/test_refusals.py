@@ -1,4 +1,4 @@
-"""What the functions of the extensions refuse, by name. Of the rasterizer: test_rasterizer_api.py."""
+"""Refusals of the extensions' functions, by name. Those of the rasterizer: test_rasterizer_api.py."""
 
 import math
 

@@ -30,7 +30,7 @@ PATH = CameraPath(tuple(Keyframe(at, (0.2 * at, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0)
 
 
 def decoded(path: Path) -> tuple[dict, list[np.ndarray]]:
-    """What ffmpeg knows of a video, and its frames."""
+    """Return ffmpeg's facts about a video, and the frames."""
     # ffmpeg's default conversion rounds down, and makes every image a level darker.
     exact = ["-vf", "scale=flags=bicubic+accurate_rnd+full_chroma_int+full_chroma_inp,format=rgb24"]
     frames = imageio_ffmpeg.read_frames(str(path), output_params=exact)
@@ -110,7 +110,7 @@ def test_each_generated_path_has_its_name_size_and_length(run, name, size, count
 
 
 def test_a_video_needs_no_photos(run, out, tmp_path, capsys, _colmap_master):
-    """Where the scene is gone, the cameras that the model folder records make the same video; views are refused."""
+    """A folder's recorded cameras make the same video where the scene is gone; views are refused."""
     PATH.write(tmp_path / "tour.json")
     options = (out / "cfg_args").read_text().replace("eval=True", "eval=False, resolution=2")
     infos = read_scene(str(_colmap_master), "images", False).train_cameras

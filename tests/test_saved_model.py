@@ -68,7 +68,7 @@ def test_a_checkpoint_of_a_part_that_is_gone_is_not_shown_without_it(colmap_scen
 
 @pytest.mark.parametrize("options", [("--train_test_exp",), ("--appearance", "ppisp"), ("--refine_poses",)])
 def test_a_planned_checkpoint_alone_can_be_loaded(colmap_scene, tmp_path, monkeypatch, options):
-    """What belongs to the photos is written beside it."""
+    """The files of the photos are written beside the checkpoint."""
 
     def stop(step: Iteration) -> None:
         if step.iteration == 4:

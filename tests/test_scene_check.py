@@ -65,7 +65,7 @@ def _alpha(*values: float | np.ndarray) -> SceneInfo:
     ],
 )
 def test_rounded_coordinates_of_maps(kept, step, part):
-    """Of cameras, as transforms.json or COLMAP have them, or of points; heights stay far from the large numbers."""
+    """Coordinates are those of cameras in transforms.json or COLMAP, or of points; heights are no large numbers."""
     random, place = np.random.default_rng(1), np.array([500123.4, 4649777.7, 312.3])
     centers, points = place + random.normal(0, 20, (12, 3)), place + random.normal(0, 20, (500, 3))
     keep = {name: np.vectorize(kept if name == part else float) for name in ("centers", "moves", "points")}

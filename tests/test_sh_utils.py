@@ -23,7 +23,7 @@ def _real(l: int, m: int, theta: np.ndarray, phi: np.ndarray) -> np.ndarray:  # 
 
 
 def test_bases_are_scipys():
-    """That of the reference's helpers, and that of the rasterizer's oracle, which takes directions of any length."""
+    """Both bases: that of the reference's helpers, and that of the oracle, which takes directions of any length."""
     d = _directions(40)
     x, y, z = d.numpy().T
     theta, phi = np.arccos(z), np.arctan2(y, x)

@@ -155,7 +155,7 @@ RESUMED = ("adc", "few", "mcmc")  # from the files of one process, and trained f
 
 
 def _told(gaussians: GaussianModel) -> list[object]:
-    """What is said of a whole model, some of whose values are then broken."""
+    """Return the facts and the error of a whole model, some of whose values are then broken."""
     told: list[object] = [cut_bounds(gaussians.raw("f_rest").detach(), gaussians.shards), gaussians.size_as_ply]
     with torch.no_grad():
         some = _random(gaussians, "broken") > 1

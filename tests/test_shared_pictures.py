@@ -77,7 +77,7 @@ def test_each_picture_is_decoded_by_one_rank_and_trains_all(scene, tmp_path):  #
 
 
 def _stores(paths: list[Path], size: tuple[int, int]) -> tuple:
-    """What a rank plans and gets, with an error for the file that is no picture."""
+    """Return the plans and the pictures of a rank, with an error for the file that is no picture."""
     store = ImageStore(ranks=ranks())
     store.plan([(path, size) for path in paths[:4]], [(path, size) for path in paths])
     store.prefetch([(path, size) for path in paths])

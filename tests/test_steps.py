@@ -133,7 +133,7 @@ def of_image(losses: Losses, package: dict, *_: object) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def without(once) -> dict:
-    """What a training without such a term leaves."""
+    """The result of a training without such a term."""
     return whole_result(plain_training(once, "default"), ITERATIONS)
 
 

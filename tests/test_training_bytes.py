@@ -138,7 +138,7 @@ def test_steps_of_a_gpu(scene, tmp_path, name, _):
 
 
 def _goes_together(*names: str) -> bool:
-    """Whether a training may have these parts, of which one strategy."""
+    """Tell whether a training may have these parts, at most one of which is a strategy."""
     if len({*names} & {*strategies()}) > 1:
         return False
     words = [str(word) for name in names for word in PART_OPTIONS[name]]

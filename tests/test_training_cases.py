@@ -180,7 +180,7 @@ def test_a_huge_world_trains_as_well(colmap_scene, tmp_path):
 
 
 def test_pictures_of_one_colour(colmap_scene, tmp_path):
-    """It is learnt if the background has another colour; if it has the same one, no Gaussian remains in the end."""
+    """The colour is learnt if the background has another one; if both are the same, no Gaussian remains in the end."""
     _paint(colmap_scene, 255)
     _train(colmap_scene, tmp_path / "out")
     assert _loss(tmp_path / "out") < 0.6  # from 0.8 and more; 0.40 was measured

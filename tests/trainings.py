@@ -204,7 +204,7 @@ def whole_result(out: Path, iteration: int) -> dict[str, bytes | list]:
 
 
 def differences(one: dict[str, bytes | list], other: dict[str, bytes | list]) -> list[str]:
-    """What differs between two results, in few words."""
+    """Describe the differences between two results, in few words."""
     pairs = zip(one["checkpoint"], other["checkpoint"], strict=True)
     found = [f"leaf {n}: {str(a)[:60]} and {str(b)[:60]}" for n, (a, b) in enumerate(pairs) if a != b]
     files = sorted({*one, *other} - {"checkpoint"})

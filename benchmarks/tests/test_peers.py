@@ -70,7 +70,7 @@ def test_a_peer_belongs_to_a_scene(tmp_path):
 
 
 def _result_of_gsplat(folder: Path) -> Path:
-    """What its trainer writes at two scored steps; a third one was not saved, so that its seconds are not known."""
+    """Write the files of gsplat's trainer at two scored steps; a third was not saved, so its seconds are not known."""
     for step, seconds, psnr in ((6999, 40.5, 28.25), (29999, 201.0, 30.5)):
         scores = {"psnr": psnr, "ssim": 0.9, "lpips": 0.12, "ellipse_time": 0.004, "num_GS": 5000}
         costs = {"mem": 1.5, "ellipse_time": seconds, "num_GS": 5000}

@@ -85,7 +85,7 @@ def test_a_frame_of_a_notebook_shows_the_page(tab, page, splats, tmp_path):
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
 def test_a_photo_fills_a_window_of_any_shape(browser, page, splats, width, height):
-    """What is above and below a wide photo on a phone fades; the help, which covers the model, begins closed."""
+    """The margins above and below a wide photo fade on a phone; the help, which covers the model, begins closed."""
     phone = width < height
     context = browser.new_context(viewport={"width": width, "height": height}, has_touch=phone, is_mobile=phone)
     tab = context.new_page()

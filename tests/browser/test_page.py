@@ -136,7 +136,7 @@ def test_the_line_between_photo_and_render_is_dragged_and_the_camera_stays(tab, 
     share, (x, y) = labelled(tab, "Slider"), (PICTURE[0] / 2, PICTURE[1] / 2)
 
     def dragged() -> bool:
-        """Whether the line has followed; if it was not drawn yet, the camera turns, and goes back at first."""
+        """Go to the camera and drag; tell whether the line has followed. Before the line is drawn, the camera turns."""
         tab.get_by_role("button", name="Go to the camera").click()
         tab.mouse.move(x, y)
         tab.mouse.down()

@@ -32,7 +32,7 @@ SHARES = """() => {  // the parts of the page, in pixels, that show photo, rende
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory) -> Path:
-    """Of 2 scenes, 3 option sets and 2 seeds, with five portrait test views: red photos and blue renders."""
+    """A report of 2 scenes, 3 option sets and 2 seeds, with five portrait test views: red photos and blue renders."""
     out = tmp_path_factory.mktemp("report")
     runs = [run for scene in ("attic", "brick") for run in set_runs(scene)]
     for run in runs:

@@ -76,7 +76,7 @@ def _on_no_device(arguments: dict) -> bool:
 
 
 def _is_plain(value: object) -> bool:
-    """Whether a value can be changed further; a tensor may be sparse or endless by now."""
+    """Tell whether a value can be changed further; a tensor may be sparse or endless by now."""
     return not torch.is_tensor(value) or (
         value.layout == torch.strided and not value.is_meta and value.dim() > 0 and 0 < value.numel() < 10_000
     )

@@ -20,7 +20,7 @@ class Fault(NamedTuple):
 
     @property
     def on_gpu(self) -> bool:
-        """Whether only CUDA kernels have it, which run in emulation here."""
+        """True if the fault is in CUDA kernels alone, which run in emulation here."""
         return "/cuda/" in self.file
 
     def apply(self, text: str) -> str:

@@ -266,7 +266,7 @@ def test_the_default_budget_follows_the_pixels():
 
 def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
     def aim(given: int, stride: float) -> int:
-        """What there is to be after the last densification, whatever there is before it."""
+        """Return the number of Gaussians to have after the last densification, whatever there is before."""
         decided = Decided(30_000, [Block(15_000, 0.0, stride / 30_000, 0.0)], None, 9.0)
         return _control(DecidedSchedule(decided), max_num_splats=given)._aim(10_000, int(14_999 / stride))
 
@@ -306,7 +306,7 @@ REACH = [
 
 @pytest.mark.parametrize(("strategy", "number", "changes", "first", "said"), REACH)
 def test_a_number_out_of_reach_is_told(strategy, number, changes, first, said):
-    """Of 300 Gaussians, in 160 iterations."""
+    """The training starts with 300 Gaussians, and takes 160 iterations."""
     control = _control(Schedule(160), strategy=strategy, max_num_splats=number, **changes)
     told = another_number(control, control._opt, 300, first)
     assert told is None if said is None else said in str(told)

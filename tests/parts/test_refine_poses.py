@@ -60,7 +60,10 @@ def _track(count: int = 60, noise: float = 0.0) -> Track:
 
 
 def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> Track:
-    """What a fisheye sees up to so many degrees from its axis. noise: radians."""
+    """Return the track of a fisheye that sees points up to so many degrees from its axis.
+
+    noise: radians.
+    """
     rng = np.random.default_rng(1)
     angle, turn = np.radians(degrees) * np.sqrt(rng.uniform(size=count)), math.tau * rng.uniform(size=count)
     rays = angle[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
@@ -72,7 +75,7 @@ def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> 
 
 @pytest.mark.parametrize("degrees", [60.0, 92.0])
 def test_fisheyes_find_a_pose_as_well_as_noise_allows(degrees):
-    """Of 0.3 pixels in 200: points at the border do not count more, and those beyond 90 degrees do count."""
+    """The noise is 0.3 pixels of 200: points at the border do not count more, and those beyond 90 degrees do count."""
     track = _wide_track(300, 3e-3, degrees)
     assert nearest_pose(POSE, track, 100.0, 1.0, BOUND) is POSE  # which noise alone does not move
     found = nearest_pose(moved_pose(POSE, 0.3 * TURN, 1.0), track, 100.0, 1.0, BOUND)
@@ -254,7 +257,7 @@ def _gradient(poses: PoseRefinement, uid: int, wanted: np.ndarray) -> np.ndarray
 
 
 def test_the_gradient_of_a_twist(tmp_path):
-    """Of the view's rows, translation and centre, against torch's through `moved`."""
+    """The gradient of the view's rows, translation and centre is compared with torch's through `moved`."""
     make_colmap_scene(tmp_path)
     scene, poses = _refinement(tmp_path)
     camera, twist = scene.getTrainCameras()[1], torch.zeros(6, dtype=torch.float64, requires_grad=True)

@@ -115,7 +115,7 @@ def test_a_finished_training_without_its_last_checkpoint_is_not_said_to_continue
     ("content", "said"), [(None, "has a model, and no checkpoint to continue"), ("{", "model.json")]
 )
 def test_a_model_of_which_nobody_knows_that_it_is_unfinished_is_not_replaced(colmap_scene, tmp_path, content, said):
-    """As of the reference, or with a damaged file."""
+    """The model is one of the reference, or has a damaged file."""
     _train(colmap_scene, tmp_path, 5, "--no_last_checkpoint")
     (tmp_path / "model.json").unlink()
     if content:

@@ -49,7 +49,7 @@ def _found(folder: Path) -> tuple[Scene, Shell, np.ndarray, np.ndarray, float]:
 
 
 def test_it_is_where_rays_meet_nothing_and_has_the_colours_there(scene):
-    """As the tracer says."""
+    """The tracer of the scene gives the expected directions and colours."""
     loaded, sky, points, colors, share = _found(scene)
     np.testing.assert_allclose(np.linalg.norm(points - sky.center, axis=1), sky.radius, rtol=1e-9)
     sky.points, things, shown, hit = points, add_sky(None), 0, 0

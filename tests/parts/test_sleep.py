@@ -245,7 +245,7 @@ def test_no_view_shows_a_block_that_sleeps_in_double():
 
 
 def test_steps_with_sleep_are_those_of_dense_adam_in_double():
-    """Of Gaussians that a view sees the gradients are random. No other row has one, or is seen."""
+    """Gaussians that a view sees have random gradients. No other row has a gradient, or is seen."""
     place, rng, worst = {"device": "cpu", "dtype": torch.float32}, np.random.default_rng(11), [0.0, 0.0]
     for _ in range(SCENES):
         slept = _clusters(rng, place, blocks=6)

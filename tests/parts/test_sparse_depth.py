@@ -74,7 +74,7 @@ def scene(_colmap_master: Path) -> Path:
 
 
 def _scores(scene: Path, folder: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
-    """What metrics.py makes of the test views' depth."""
+    """Return the scores of metrics.py for the test views' depth."""
     monkeypatch.setattr("sys.argv", ["render.py", "-m", str(folder), "--skip_train", "--depth", "--quiet"])
     render.main()
     monkeypatch.setenv("GS_DOWNLOAD", "0")

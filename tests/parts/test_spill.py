@@ -60,7 +60,7 @@ SCENE = SimpleNamespace(images=None, getTrainCameras=lambda: [VIEW])
 
 
 def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> GpuMemory:
-    """That of a GPU, which need not be there; 50 Gaussians are there."""
+    """Return the memory of a GPU, which need not exist, with room for 50 Gaussians reserved."""
     monkeypatch.setattr(GpuMemory, "_limit_torch", lambda self, each: None)
     monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: photos)
     monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 2**30)

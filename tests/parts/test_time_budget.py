@@ -220,7 +220,10 @@ def _evenly(length: int, count: int) -> Decided:
 
 
 def _actions(stride: int, white: bool = False, **changed: int) -> dict[int, rules.Actions]:
-    """What adaptive density control does in each iteration of a run that takes so many steps of 30,000 at a time."""
+    """Return the actions of adaptive density control in each iteration of a run of 30,000 steps.
+
+    stride: steps that an iteration takes at once.
+    """
     schedule, opt = DecidedSchedule(_evenly(30_000, 30_000 // stride)), options(**changed)
     every = range(1, schedule.ends + 1)
     return {t: rules.actions(t, opt, white, schedule.span(t), schedule.stride(t)) for t in every}
@@ -258,7 +261,7 @@ def test_few_steps_densify_twenty_times_without_resets_that_they_do_not_recover_
 
 
 def _noted(monkeypatch: pytest.MonkeyPatch, look: Callable[[Run, Iteration], object]) -> list:
-    """What there is when each iteration begins, before it sets rates and SH degree."""
+    """Collect the results of `look` at the begin of each iteration, before it sets rates and SH degree."""
     found = []
     monkeypatch.setattr(ProgressBar, "begins", lambda self, step: found.append(look(self._run, step)))
     return found

@@ -42,7 +42,7 @@ def ply_count(path: Path) -> int:
 
 
 def fell(losses: list[float], by: float = 0.98) -> bool:
-    """Whether the last quarter of the losses is lower than the first, by this factor."""
+    """Tell whether the last quarter of the losses is lower than the first, by this factor."""
     part = max(len(losses) // 4, 1)
     return sum(losses[-part:]) < by * sum(losses[:part])
 

@@ -133,7 +133,7 @@ def _page(folder, names, survey, **report) -> str:
 
 
 def test_the_page_shows_what_is_wrong_with_each_photo(folder):
-    """Of e and f there are no files."""
+    """Photos e and f have no files."""
     text = _page(folder, [*NAMES, "e<&.jpg", "f.jpg"], _survey(), tried=[{"way": "global", "against": ["f.jpg"]}])
     cards = re.findall(r'<div id="photo\d+".*?<b>(.*?)</b>\n(.*?)</div>', text, re.S)
     assert [(name, re.findall('"problem">(.*?)<', card)) for name, card in cards] == [

@@ -131,7 +131,7 @@ def test_a_second_run_does_only_what_changed(copy, capsys):
 
 
 def test_the_command_that_trains_can_be_copied(copy, monkeypatch, capsys):
-    """It ends the output, unless too few photos are placed."""
+    """The command ends the output, unless too few photos are placed."""
     inputs, found = convert.record_inputs, {"again": ["Use a fixed exposure, or train these with --appearance ppisp"]}
     monkeypatch.setattr(convert, "record_inputs", lambda *a, **k: inputs(*a, **k) | found)
     convert.main(["-s", str(copy), "--no_gpu", "--resize"])

@@ -139,7 +139,7 @@ def test_gps_gives_metres_and_north(tmp_path, lost):
 
 
 def _told(gps: np.ndarray, how: str) -> list[np.ndarray | None]:
-    """What is told of GPS (N,3) in a way."""
+    """Return GPS positions (N, 3) as photos may state them: in part, without heights, or with an outlier."""
     if how in ("no heights", "one height"):
         gps[:, 2] = np.nan if how == "no heights" else 120.0
     if how == "an outlier":

@@ -118,7 +118,7 @@ def _other_photos(scene: Path) -> None:
 
 @pytest.mark.parametrize("log", [True, False], ids=["log", "no log"])
 def test_colours_that_nothing_explains(folder, log):
-    """What was recorded tells that something has changed."""
+    """With a log, the recorded scores show that something has changed."""
     for name in () if log else ("train_log.json", "error_vs_time.csv"):
         (folder / name).unlink()
     _edit(folder, lambda rows: rows | {"f_dc": -rows["f_dc"], "f_rest": -rows["f_rest"]})
@@ -152,7 +152,7 @@ def test_good_models(folder, change):
 
 
 def test_a_model_of_small_photos_is_looked_at_in_their_size(scene, tmp_path):
-    """It has no detail for larger views, where its score would be far below what training recorded."""
+    """Such a model lacks the detail of larger views, in which it would score far below the recorded numbers."""
     words = "--eval", "-r", 4, "--iterations", 800, "--test_iterations", 800, "--disable_viewer", "--quiet"
     train_on(scene, tmp_path / "small", *words)
     assert _problems(tmp_path / "small") == []

@@ -96,7 +96,7 @@ class Evaluation:
 
 @pytest.fixture
 def evaluate(tmp_path) -> Evaluation:
-    """Of a folder with the scenes `attic` (COLMAP) and `brick` (Blender)."""
+    """Evaluation of a folder with the scenes `attic` (COLMAP) and `brick` (Blender)."""
     folder = tmp_path / "scenes"
     (folder / "attic" / "sparse").mkdir(parents=True)
     (folder / "brick").mkdir()
@@ -251,7 +251,7 @@ def test_an_interrupt_beyond_the_iterations_is_resumed(evaluate):
 
 
 def test_a_checkpoint_of_a_failure_is_not_resumed(evaluate, capsys):
-    """It is at iteration 9."""
+    """The checkpoint is at iteration 9."""
     full = evaluate.scenes / "attic" / "full"
     full.touch()
     evaluate.fails("attic")

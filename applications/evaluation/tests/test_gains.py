@@ -22,7 +22,7 @@ def test_intervals_are_those_of_a_paired_t_test(seed):
 
 @pytest.mark.parametrize(("count", "seen"), [(3, 0.75), (9, 0.23)])
 def test_what_so_many_seeds_can_show(count, seen):
-    """Of differences that vary by 0.3 dB."""
+    """The differences vary by 0.3 dB."""
     spread = np.linspace(-1, 1, count)
     assert compute_interval((0.3 * spread / spread.std(ddof=1)).tolist())["half"] == pytest.approx(seen, abs=0.005)
 

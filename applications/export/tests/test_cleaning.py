@@ -42,7 +42,7 @@ def views() -> ScoredViews:
 
 @pytest.fixture(scope="module")
 def cleaned(trained, views) -> tuple[Cleaning, Cleaning]:
-    """Of the model, and of that with floaters."""
+    """Cleanings of the model, and of the model with floaters."""
     _, scene = trained
     cameras = scene.getTrainCameras()
     floating = model_of(with_floaters(splats_of(scene.gaussians), poses_of(cameras), FLOATERS, 0.7))
@@ -60,7 +60,7 @@ def test_floaters_go(cleaned, trained):
 
 @pytest.mark.slow
 def test_no_view_loses_more_than_allowed(cleaned, trained, views):
-    """As an independent rendering finds."""
+    """An independent rendering measures the loss."""
     of_model, floating = cleaned
     _, scene = trained
     assert 0 < (~of_model.keep).sum() < 0.5 * len(scene.gaussians)

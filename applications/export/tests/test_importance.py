@@ -52,7 +52,7 @@ def test_changes_are_those_of_a_removal():
 
 
 def test_any_first_part_is_a_model(scene):
-    """It loses little, and less than the Gaussians of the largest sums of blending weights do."""
+    """A part loses little, and less than the Gaussians of the largest sums of blending weights do."""
     cameras, count = scene.getTrainCameras(), len(scene.gaussians)
     order = most_needed(scene.gaussians, cameras, VIEWS, count)
     assert order.sort().values.tolist() == list(range(count))
@@ -67,7 +67,7 @@ def test_any_first_part_is_a_model(scene):
 
 
 def test_masked_pixels_do_not_count(scene):
-    """What only they show goes first."""
+    """Gaussians that only masked pixels show go first."""
     views = ScoredViews(pipeline(), torch.zeros(3), False)
     left = torch.arange(80).expand(1, 60, 80) < 40
     views.mask = lambda camera: left

@@ -109,7 +109,7 @@ def test_a_mesh_lies_on_the_surface_and_faces_outwards(of_ball):
 
 
 def test_chunks_have_no_seams(ball, views, monkeypatch):
-    """Of blocks one by one, the mesh has the same edges with one triangle as of all at once."""
+    """A mesh made block by block has the same edges with one triangle as a mesh made at once."""
     volume, open_edges, sizes = fuse_volume(Surfaces(ball, views, pipeline()), VOXEL), [], []
     for side in (16, 1):
         monkeypatch.setattr(mesh, "_CHUNK", side)

@@ -1,4 +1,4 @@
-"""Where a page begins, its title and picture, and that it is cleaned."""
+"""The start of a page: first view, title and picture, and the cleaning."""
 
 import math
 from pathlib import Path

@@ -63,7 +63,7 @@ def around(make_path=None) -> SceneInputs:
 
 @pytest.mark.parametrize("scale", [2.5, 0.02])
 def test_a_moved_model_looks_the_same_from_a_moved_camera(scale):
-    """Of SH degree 3. Float32 rounds to other values, so few weights pass the rasterizer's cutoff of 1/255, or fail."""
+    """The model has SH degree 3. Float32 rounds to other values, so a few weights pass or fail the cutoff of 1/255."""
     similarity, splats, camera = replace(SOME, scale=scale), balls(degree=3), cameras()[1]
     moved, (other,) = move_splats(splats, similarity), move_cameras([camera], similarity)
     before, after = rendered(splats, camera), rendered(moved, other)
@@ -203,7 +203,7 @@ def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
 
 @pytest.mark.parametrize("upright", [True, False])
 def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
-    """As Blender reads it: what was x right, y down, z forward is x right, y forward, z up."""
+    """Blender reads x right, y down, z forward as x right, y forward, z up."""
     points = np.float32([[1, 2, 3], [4, 5, 6], [7, 8, 10]])
     mesh = replace(textured(points), colors=np.zeros((3, 3), np.uint8))
     monkeypatch.setattr("applications.export.mesh.measure_surfaces", lambda *_: ())

@@ -1,4 +1,4 @@
-"""What guests of a page stop at: its octree, read as its form is described, and where a floor and walls are."""
+"""Obstacles of a page's guests: the octree, read by the description of its form, and where a floor and walls are."""
 
 import json
 import re
@@ -15,7 +15,7 @@ from utils.system_utils import UserError
 
 
 def solid_at(solid: Solid, places: np.ndarray) -> list[bool]:
-    """Whether points (N, 3) of the viewer's world are solid."""
+    """Tell for each point (N, 3) of the viewer's world whether it is solid."""
     about, words = json.loads(solid.about), np.frombuffer(solid.content, "<u4")
     nodes, masks = words[: about["nodeCount"]].tolist(), words[about["nodeCount"] :].tolist()
     assert len(masks) == about["leafDataCount"]

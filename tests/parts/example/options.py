@@ -1,4 +1,4 @@
-"""What the worked examples add to arguments/features.py."""
+"""The worked examples' entries of arguments/features.py."""
 
 from arguments.features import FEATURES, Options
 from arguments.option import Option, at_least
