@@ -3,6 +3,7 @@
 import argparse
 import io
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,8 +67,21 @@ def _alpha(*values: float | np.ndarray) -> SceneInfo:
 )
 def test_rounded_coordinates_of_maps(kept, step, part):
     """Coordinates are those of cameras in transforms.json or COLMAP, or of points; heights are no large numbers."""
-    random, place = np.random.default_rng(1), np.array([500123.4, 4649777.7, 312.3])
-    centers, points = place + random.normal(0, 20, (12, 3)), place + random.normal(0, 20, (500, 3))
+    found = _said_of_map((500123.4, 4649777.7, 312.3), 20, kept, part)
+    what = "points" if part == "points" else "cameras"
+    assert (f"coordinates are rounded: the {what} to steps of {step}, in a scene with" in found) == bool(step)
+    assert ("are rounded" in found) == bool(step)
+
+
+@pytest.mark.parametrize("place", [(1e4, 2e4, 30.0), (5000.0, 0.0, 0.0), (500123.4, 5300456.7, 212.0)])
+def test_coordinates_far_from_the_origin_are_not_called_rounded(place):
+    assert "are rounded" not in _said_of_map(place, 2, float, "centers")
+
+
+def _said_of_map(place: tuple[float, float, float], spread: float, kept: Callable, part: str) -> str:
+    """Findings on a scene at a place of a map. kept: rounds the coordinates of `part`."""
+    random = np.random.default_rng(1)
+    centers, points = place + random.normal(0, spread, (12, 3)), place + random.normal(0, spread, (500, 3))
     keep = {name: np.vectorize(kept if name == part else float) for name in ("centers", "moves", "points")}
     views = []
     for n, center in enumerate(keep["centers"](centers)):
@@ -78,10 +92,7 @@ def test_rounded_coordinates_of_maps(kept, step, part):
                                 image=Image.fromarray(COLORS)))  # fmt: skip
     cloud = BasicPointCloud(keep["points"](points), np.zeros((500, 3)), np.zeros((500, 3)))
     info = SceneInfo(cloud, views, [], {"radius": 1.0}, None)
-    found = said(local(info, world_offset(info)))
-    what = "points" if part == "points" else "cameras"
-    assert (f"coordinates are rounded: the {what} to steps of {step}, in a scene with" in found) == bool(step)
-    assert ("are rounded" in found) == bool(step)
+    return said(local(info, world_offset(info)))
 
 
 @pytest.mark.parametrize(
@@ -184,6 +195,10 @@ def test_masks_of_shared_pixels(tmp_path, turned):
     assert "17% of each photo, at the bottom, is the same" in found.text
     with pytest.raises(UserError, match="no pixels that nearly all photos in .* share"):
         write_shared_masks(tmp_path / "masks", tmp_path / "other")
+    with pytest.raises(UserError, match="no folder .*nowhere; name the folder of the photos"):
+        write_shared_masks(tmp_path / "nowhere", tmp_path / "other")
+    with pytest.raises(UserError, match="would count as photos of"):
+        write_shared_masks(tmp_path / "input", tmp_path / "input" / "masks")
 
 
 def test_blurred_photos_are_named_whatever_they_show(sound, tmp_path):

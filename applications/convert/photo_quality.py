@@ -61,7 +61,7 @@ def _colors_at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tu
     """
     pixels = small(path)
     size = pixels.shape[1::-1]
-    places = (places * size).astype(int)
-    inside = (numbers >= 0) & (places >= 0).all(1) & (places < size).all(1)
-    column, row = places[inside].T
+    places = places * size
+    inside = (numbers >= 0) & (places >= 0).all(1) & (places < size).all(1)  # none of what is not finite
+    column, row = places[inside].astype(int).T
     return numbers[inside], pixels[row, column] / 255

@@ -22,7 +22,11 @@ from utils.system_utils import UserError, atomic_write, run_cli
 
 def write_shared_masks(photos: Path, masks: Path) -> int:
     """Write the masks into a folder, and return their number. UserError if there is nothing to mask."""
-    names = sort_inputs(photos, skip_unreadable=True).photos if photos.is_dir() else []
+    if not photos.is_dir():
+        raise UserError(f"no folder {photos}; name the folder of the photos")
+    if masks.resolve().is_relative_to(photos.resolve()):
+        raise UserError(f"masks in {masks} would count as photos of {photos}; name a folder beside it")
+    names = sort_inputs(photos, skip_unreadable=True).photos
     shared = find_shared(looks_at([Photo(name, photos / name) for name in names], len(names)))
     sizes = {name: read_upright_size(photos / name) for name in names}
     named = [name for name in names if sizes[name] in shared]

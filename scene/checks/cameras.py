@@ -106,13 +106,15 @@ def _step(values: np.ndarray, least: float) -> float | None:
     size = np.abs(values)
     if not np.isfinite(size).all() or not size.any():
         return None
+    spread = np.ptp(values, axis=0).max()
     values, size = values[large := size > 0.01 * size.max()], size[large]  # others may have finer steps
     places = np.floor(np.log10(size)) + 1  # before the point
     finest = int(np.floor(places.max() - np.log10(least)))
     rounded = [(10.0 ** (places - digits), 10.0 ** (places.max() - digits)) for digits in range(1, finest + 1)]
     single = np.spacing(size.astype(np.float32)).astype(np.float64)
     for steps, largest in [*rounded, *([(single, float(single.max()))] if single.max() >= least else [])]:
-        if (np.abs(values / steps - np.round(values / steps)) < _OFF).mean() > _NEARLY_ALL:
+        near = np.abs(values / steps - np.round(values / steps)) < _OFF
+        if near.mean() > _NEARLY_ALL and largest <= spread:  # else all lie far away, as map coordinates do
             return float(largest)
     return None
 
