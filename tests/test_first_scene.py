@@ -10,6 +10,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+import applications.demo  # noqa: F401  (whose scene the notebook makes)
+
 ROOT = Path(__file__).resolve().parents[1]
 FILE = ROOT / "docs/notebooks/first_scene.ipynb"
 # Colab's module, whose dialogs have an answer each.

@@ -12,6 +12,7 @@ from fuzz import sandbox, worker
 from fuzz.crafted_pickles import CRAFTED
 from fuzz.pickles import Hostile
 
+import applications.export  # noqa: F401  (some kinds of cases write by it)
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]

@@ -136,7 +136,7 @@ def test_ranks_with_other_code_are_refused(colmap_scene, tmp_path):
     for room in {path.parent for path in ROOT.glob("*/__init__.py")} | {ROOT / "utils"}:
         shutil.copytree(room, other / room.name)
     shutil.copy(ROOT / "train.py", other)
-    with (other / "splatting" / "training" / "schedule.py").open("a") as file:
+    with (other / "splatting" / "schedule.py").open("a") as file:
         file.write("# changed\n")
     done = launch_fault(colmap_scene, tmp_path, "code 1 0", OTHER_CODE=str(other))
     said = "error: rank 1 differs from rank 0 in splatting/schedule.py; give all ranks the same files"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-ROOMS = ("arguments", "gaussian_renderer", "lpipsPyTorch", "scene", "splatting", "utils")
+ROOMS = ("arguments", "gaussian_renderer", "groundwork", "lpipsPyTorch", "scene", "splatting", "utils")
 
 # Trains two steps and renders, by the names under gaussian_splatting, by the plain ones, and by both mixed.
 SCRIPT = """

@@ -170,7 +170,7 @@ def test_refusals_before_anything_is_written(colmap_scene, blender_scene, tmp_pa
         "--sky does not work with --strategy mcmc": ["--sky", "auto", "--strategy", "mcmc"],
         "--train_test_exp means --appearance affine": ["--train_test_exp", "--appearance", "ppisp"],
         "--paused needs --viewer": ["--paused"],
-        "between 0": ["--viewer", 70_000],
+        **({"between 0": ["--viewer", 70_000]} if (ROOT / "applications").is_dir() else {}),
         "--resume needs -m": ["-m", "", "--resume"],
     }
     for words, options in cases.items():
