@@ -38,7 +38,7 @@ class Iteration:
     background: Tensor  # (3,), random or that of the scene
     changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
     started: float  # seconds of training before it
-    span: range  # steps of the schedule that it stands for (training/schedule.py); of the last, all that are left
+    span: range  # steps of the schedule that it stands for (splatting/schedule.py); of the last, all that are left
     rests: bool = False  # an earlier run ended with it, and took no step
     terms: dict[str, Term] = field(default_factory=dict)  # that parts add to the loss, weights included
     captured: bool = True  # a captured step may record the terms
