@@ -20,6 +20,7 @@ PAGES = {
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",
     "benchmarks/README.md": "benchmarks.md",
+    "submodules/diff-gaussian-rasterization/csrc/README.md": "inside/rasterizer_sources.md",
 }
 OPTIONS = "reference/options.md"  # in the repository it says which command lists them
 SOURCES = {page: source for source, page in PAGES.items()}
