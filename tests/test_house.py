@@ -287,6 +287,10 @@ def test_nothing_needs_the_function_of_gsplat():
     words = re.compile(r"diff_gaussian_rasterization\.gsplat|\b(?:OPERATORS|ops)\.(?:describe\w*|pinhole)\b")
     for path in (path for path in _python() if not {"gsplat", "benchmarks"} & set(path.parts)):
         assert not words.search(path.read_text(encoding="utf-8")), path
+    removed = (RASTERIZER / "csrc" / "README.md").read_text(encoding="utf-8").partition("## Without gsplat's")[2]
+    for path in (*ROOT.glob("tests/**/*.py"), *ROOT.glob("benchmarks/**/*.py")):
+        if words.search(path.read_text(encoding="utf-8")):
+            assert path.name in removed or path == Path(__file__), f"csrc/README.md does not say that {path} uses it"
 
 
 def test_tensors_are_seen_in_one_folder():
