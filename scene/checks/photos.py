@@ -18,6 +18,7 @@ from scene.images.masks import Mask
 from scene.readers.info import CameraInfo
 from utils.system_utils import UserError
 
+LOOKED_AT = 16  # photos that a training decodes, small; any check finds shared pixels in these, for one share
 FEWEST_VIEWS = 20
 _WIDE = 1600  # pixels
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window
@@ -97,7 +98,7 @@ def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True) -> Ite
         if hidden := [look for look in looks if look.hidden_by == cause]:
             severity = Severity.HOPELESS if len(hidden) == len(looks) else Severity.PROBLEM
             yield Finding(f"{_of(hidden, looks)} show nothing, as every pixel is left out by {cause}", remedy, severity)
-    yield from check_shared([look for look in looks if not look.hidden_by])
+    yield from check_shared([look for look in looks[:LOOKED_AT] if not look.hidden_by])
 
 
 def check_shared(looks: Sequence[Look]) -> Iterator[Finding]:

@@ -14,15 +14,14 @@ from scene.checks.cameras import check_cameras, check_extent, check_lens_shapes,
 from scene.checks.conversion import check_conversion, describe_changed_photos, describe_left_out
 from scene.checks.fit import check_agreement, check_geometry
 from scene.checks.photo_files import check_blur, check_duplicates
-from scene.checks.photos import SHARED_TEXT, check_photos, check_size, check_views
+from scene.checks.photos import LOOKED_AT, SHARED_TEXT, check_photos, check_size, check_views
 from scene.checks.points import check_cloud, check_points
 from scene.dataset_readers import SceneInfo, read_scene
 from scene.readers.info import NEAREST, as_camera_info
 from scene.scene import Scene
 from utils.system_utils import UserError
 
-LOOKED_AT = 16  # photos that a training decodes, small,
-MOST_PHOTOS = 100  # and the doctor
+MOST_PHOTOS = 100  # that the doctor decodes, small
 _LINES = 5  # most findings that a training prints
 
 
@@ -37,7 +36,8 @@ def findings(
     alpha = getattr(options, "mask_meaning", "") != "none"
     train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
-    photos = [*check_photos(train, most, alpha), *check_duplicates(info, halves)]
+    views = sorted((*train, *test), key=lambda view: str(view.image_name))  # the same ones whatever is held out
+    photos = [*check_photos(views, most, alpha), *check_duplicates(info, halves)]
     found = [*check_cameras(info), *photos, *([] if has_shared_pixels(photos) else check_points(info))]
     return sorted(found, key=lambda one: -one.severity)
 
