@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
+from groundwork.applications import has_application
 from groundwork.finding import Finding, Severity, from_error, note
 from scene.checks.cameras import check_cameras, check_extent, check_lens_shapes, check_lenses
 from scene.checks.conversion import check_conversion, describe_changed_photos, describe_left_out
@@ -56,7 +57,8 @@ def report(found: list[Finding], source: str | os.PathLike, quiet: bool = False)
     for one in found[:_LINES]:
         print(f"warning: {one}", file=sys.stderr)
     if len(found) > _LINES:
-        print(f"{len(found) - _LINES} more: python doctor.py -s {source}", file=sys.stderr)
+        command = f": python doctor.py -s {source}" if has_application("doctor") else ""
+        print(f"{len(found) - _LINES} more{command}", file=sys.stderr)
 
 
 def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
