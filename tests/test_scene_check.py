@@ -2,6 +2,7 @@
 
 import argparse
 import io
+import shlex
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,7 +20,7 @@ from applications.convert.images import find_masks, find_shared_pixels
 from applications.convert.shared_masks import write_shared_masks
 from groundwork.finding import Finding, Severity
 from scene.checks.photo_files import _same_photos, check_blur
-from scene.checks.photos import check_photos
+from scene.checks.photos import SHARED_TEXT, check_photos
 from scene.checks.scene import check_dataset, findings, report
 from scene.gaussians.copies import clusters_of
 from scene.gaussians.start import start_rows
@@ -171,15 +172,21 @@ def test_training_and_doctor_name_one_share_of_shared_pixels():
     assert "of each photo, at the bottom, is the same" in shares[0] and shares[0] == shares[1]
 
 
-def test_other_faults_wait_for_shared_pixels(scene):
-    """Photos with a caption do not fit their points, either."""
+def test_other_faults_wait_for_shared_pixels(scene, monkeypatch):
+    """Photos with a caption do not fit their points, either. Masks by the command that is named end the fault."""
     for path in (scene / "images").rglob("*.png"):
         photo = np.asarray(Image.open(path)).copy()
         photo[40:] = TEXTURE.repeat(2, 0).repeat(2, 1)[: HEIGHT - 40, :WIDTH]
         Image.fromarray(photo).save(path)
-    texts = [line.text for line in check_dataset(str(scene), "images") if line.is_problem]
+    lines = [line for line in check_dataset(str(scene), "images") if line.is_problem]
+    texts = [line.text for line in lines]
     assert texts[:2] == ["only 17 photos", "only 300 points to start from; 1000 or more are good"]
     assert "of each photo, at the bottom" in texts[2] and len(texts) == 3
+    write_shared_masks(*map(Path, shlex.split(lines[-1].remedy.split("`")[1])[-2:]))
+    assert SHARED_TEXT not in str(check_dataset(str(scene), "images", MaskOptions("images_masks")))
+    monkeypatch.setattr("scene.checks.photos.has_application", lambda name: False)
+    (without,) = [line.remedy for line in check_dataset(str(scene), "images") if SHARED_TEXT in line.text]
+    assert without == "mask it, and pass the folder of the masks as --masks of train.py"
 
 
 @pytest.mark.parametrize("turned", [False, True])
