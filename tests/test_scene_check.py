@@ -281,10 +281,10 @@ def test_a_sound_scene_is_passed(sound):
     [
         ({"fx": 1.2, "fy": 1.7}, "a focal length of 1.2 pixels); give focal lengths in pixels (these may be in parts"),
         ({"fx": 6.0, "fy": 6.0}, "these may be in millimetres"),
-        ({"fx": 5000.0, "fy": 5000.0}, "17 cameras have odd opening angles"),
-        ({"cx": 0.5, "cy": 0.5}, "principal point in a corner or at an edge"),
-        ({"cx": 192.0, "cy": 128.0}, "principal point in a corner or at an edge"),
-        ({"fy": 300.0}, "focal lengths in x and y that differ more than twofold"),
+        ({"fx": 5000.0, "fy": 5000.0}, "odd opening angles of 17 cameras"),
+        ({"cx": 0.5, "cy": 0.5}, "principal point of 17 cameras is in a corner or at an edge"),
+        ({"cx": 192.0, "cy": 128.0}, "principal point of 17 cameras is in a corner or at an edge"),
+        ({"fy": 300.0}, "focal lengths in x and y of 17 cameras differ more than twofold"),
     ],
 )
 def test_cameras(sound, fields, text):
@@ -495,4 +495,4 @@ def test_records_of_other_readers_are_judged(sound):
     info, names = read(sound), CameraInfo._fields
     plain = [argparse.Namespace(**{name: getattr(view, name) for name in names}) for view in info.train_cameras]
     plain[0].FovX = 3.1
-    assert "1 cameras have odd opening angles" in said(info._replace(train_cameras=plain))
+    assert "odd opening angles of 1 camera (" in said(info._replace(train_cameras=plain))

@@ -12,6 +12,7 @@ from pathlib import Path
 from applications.doctor import environment
 from arguments import OptionParser
 from groundwork.finding import Finding
+from groundwork.host.listing import counted
 
 
 def diagnose(source: str | None, images: str | None, model: str | None, iteration: int, masks: str = "") -> int:
@@ -78,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     args = parser.parse_args(argv)
     problems = diagnose(args.source_path, args.images, args.model_path, args.iteration, args.masks)
     if problems:
-        print(f"{problems} problem{'s' if problems > 1 else ''}")
+        print(counted(problems, "problem"))
         sys.exit(1)
     print("no problems found: ready")
 

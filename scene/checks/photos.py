@@ -12,7 +12,7 @@ from PIL import ExifTags, Image, ImageOps
 from groundwork.applications import has_application
 from groundwork.files.image_files import UNREADABLE, open_image
 from groundwork.finding import Finding, Severity, fine
-from groundwork.host.listing import some
+from groundwork.host.listing import counted, some
 from groundwork.host.start import typed_command
 from scene.checks.photo_files import shrunk
 from scene.checks.shared_pixels import place_of, shared_pixels
@@ -84,11 +84,12 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
     sizes = Counter(camera.file_size for camera in cameras)
     listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
     listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
-    yield fine(f"{len(cameras)} photos, none missing and all readable: {listed}")
+    count = counted(len(cameras), "photo")
+    yield fine(f"{count}, none missing and all readable: {listed}")
     if len(cameras) < FEWEST_VIEWS:
-        yield Finding(f"only {len(cameras)} photos", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
+        yield Finding(f"only {count}", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
     if wide := sum(n for (width, _), n in sizes.items() if width > _WIDE):
-        yield fine(f"{wide} photos are wider than {_WIDE} pixels and train at that width unless -r 1 is given")
+        yield fine(f"{counted(wide, 'photo')} wider than {_WIDE} pixels, to train at that width unless -r 1 is given")
 
 
 def check_photos(
