@@ -102,7 +102,7 @@ def check_dataset(source: str, images: str, masks: MaskOptions = NO_MASKS) -> li
     checks += [found, check_blur(info, MOST_PHOTOS)]
     if not any(check_lens_shapes(info)) and not has_shared_pixels(found):  # else poses have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
-    return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
+    return [*_notes(said.getvalue()), *check_conversion(source), *chain(*checks)]
 
 
 def _notes(said: str) -> list[Finding]:

@@ -205,6 +205,11 @@ def test_what_convert_noted(colmap_scene):
     assert "PROBLEM only 17 of 30 photos were placed by convert.py -> take more photos between them" in said
     path.write_text("{")
     assert "convert_report.json is damaged" in str(problems(check_dataset(str(colmap_scene), "images")))
+    path.write_text(json.dumps(report | {"unusable": "the camera turned, so do not train; walk"}))
+    verdict = "PROBLEM convert.py says of this scene: the camera turned, so do not train"
+    assert problems(check_dataset(str(colmap_scene), "images"))[0].startswith(verdict)
+    (colmap_scene / "sparse" / "0" / "points3D.bin").write_bytes(bytes(8))  # none
+    assert problems(check_dataset(str(colmap_scene), "images")) == [f"{verdict} -> walk"]
 
 
 @pytest.fixture
