@@ -205,8 +205,8 @@ def test_masks_of_shared_pixels(tmp_path, turned):
     for mask in masks.values():
         kept = np.asarray(Image.open(mask))
         assert kept[:37].all() and not kept[40:].any()
-    assert find_shared_pixels(tmp_path / "input", names, masks) == []
-    (found,) = find_shared_pixels(tmp_path / "input", names, {})
+    assert find_shared_pixels(tmp_path / "input", names, masks, tmp_path) == []
+    (found,) = find_shared_pixels(tmp_path / "input", names, {}, tmp_path)
     assert "17% of each photo, at the bottom, is the same" in found.text
     with pytest.raises(UserError, match="no pixels that nearly all photos in .* share"):
         write_shared_masks(tmp_path / "masks", tmp_path / "other")

@@ -94,6 +94,22 @@ def test_a_python_without_torch_is_named():
     )
 
 
+@pytest.mark.parametrize(
+    ("script", "said"),
+    [
+        ("SimpleNamespace(rasterize=1).step_", "error: the rasterizer has no step_, as the extensions do not fit this"),
+        ("from simple_knn import absent", "error: cannot import name 'absent' from 'simple_knn' ("),
+        ("SimpleNamespace().x", "Traceback"),
+    ],
+)
+def test_an_extension_that_lacks_something_is_one_sentence(script, said):
+    code = f"from types import SimpleNamespace; from groundwork.host.start import prepare; prepare(); {script}"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    is_told = not said.startswith("Traceback")
+    assert done.stderr.startswith(said) and done.returncode == 1 + is_told
+    assert not is_told or (done.stderr.count("\n") == 1 and "; run `make install` or `pip install .` in" in done.stderr)
+
+
 def test_the_command_that_a_person_types(monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "bin x" / "python"))

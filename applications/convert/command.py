@@ -124,8 +124,7 @@ def _print_outcome(layout: Layout, found: Inputs, adding: bool) -> None:
     )
     print(f"Report: {layout.page}")
     if found.unused:
-        unused = counted(len(found.unused), "file")
-        print(f"{unused} in {layout.input.name} not used; {layout.report.name} has the reasons")
+        print(f"{counted(len(found.unused), 'file')} in {layout.input.name} unused; {layout.report.name} has reasons")
     if adding:
         print(describe_added(layout, report["left_out"]))
     for line in notes:

@@ -82,7 +82,7 @@ def check_images(layout: Layout, names: Sequence[str], masks: Path | None) -> No
             _check_mask(with_mask[name], name, size)
 
     _do_for_all(check, names, "Checking photos", f"replace or remove them, {_OR_WITHOUT}")
-    for found in find_shared_pixels(layout.input, names, with_mask):
+    for found in find_shared_pixels(layout.input, names, with_mask, layout.input):
         print(f"warning: {found}", file=sys.stderr)
 
 
@@ -100,17 +100,15 @@ def find_panoramas(folder: Path, names: Sequence[str]) -> tuple[list[str], list[
     return wide, marked
 
 
-def find_shared_pixels(
-    folder: Path, names: Sequence[str], masks: Mapping[str, Path], place: Path | None = None
-) -> list[Finding]:
+def find_shared_pixels(folder: Path, names: Sequence[str], masks: Mapping[str, Path], place: Path) -> list[Finding]:
     """Find pixels that nearly all photos in a folder share.
 
     masks: files by a photo's name.
-    place: the user's folder of these photos, if that is another.
+    place: the user's folder of these photos.
     """
     given = {name: Mask(path) for name, path in masks.items() if path.is_file()}
     photos = [Photo(name, folder / name, given.get(name)) for name in names]
-    return [*check_shared(looks_at(photos, _COMPARED), place or folder)]
+    return [*check_shared(looks_at(photos, _COMPARED), place)]
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:

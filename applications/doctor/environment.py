@@ -159,7 +159,7 @@ def _check_rasterizer(torch) -> Finding:
     tensors = {name: value.to(device) for name, value in settings._asdict().items() if torch.is_tensor(value)}
     try:
         ours = rasterizer.rasterize(**moved, settings=settings._replace(**tensors)).color.cpu()
-    except RuntimeError as error:
+    except (AttributeError, RuntimeError) as error:
         return Finding(
             f"the rasterizer fails on {device} ({str(error).splitlines()[0]})", f"install it again: {again} ."
         )

@@ -9,11 +9,13 @@ import gc
 import importlib.util
 import io
 import os
+import re
 import shlex
 import signal
 import sys
 import threading
 from pathlib import Path
+from typing import Any
 
 from groundwork.host import torchrun
 from groundwork.host.interrupt import raise_on_signals
@@ -40,6 +42,19 @@ def prepare() -> None:
     gc.disable()
     open_outputs()
     keep_freed_memory()
+    sys.excepthook = _end_by_misfit
+
+
+def _end_by_misfit(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+    """Print one sentence, and exit 2, where an extension lacks what this checkout needs; else print the traceback."""
+    is_import = isinstance(error, ImportError) and re.search("diff_gaussian|fused_ssim|simple_knn", str(error))
+    if not is_import and not hasattr(getattr(error, "obj", None), "rasterize"):  # the rasterizer, or its operators
+        return sys.__excepthook__(kind, error, trace)
+    said = str(error) if is_import else f"the rasterizer has no {error.name}"
+    if "`pip install" not in said:
+        said += ", as the extensions do not fit this checkout; run `make install` or `pip install .` in the repository"
+    print(f"error: {said}", file=sys.stderr)
+    sys.exit(2)
 
 
 def after_imports() -> None:

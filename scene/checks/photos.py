@@ -92,20 +92,18 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
         yield fine(f"{counted(wide, 'photo')} wider than {_WIDE} pixels, to train at that width unless -r 1 is given")
 
 
-def check_photos(
-    views: Sequence[Any], most: int, has_alpha: bool = True, photos: Path = Path("PHOTOS")
-) -> Iterator[Finding]:
+def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True, place: str = "PHOTOS") -> Iterator[Finding]:
     """Find photos of which no pixel counts, and pixels that all photos share; at most `most` photos are decoded.
 
     has_alpha: whether their alpha counts.
-    photos: their folder, for messages.
+    place: their folder, for messages.
     """
     looks = looks_at(views, most, has_alpha)
     for cause, remedy in _HIDDEN.items():
         if hidden := [look for look in looks if look.hidden_by == cause]:
             severity = Severity.HOPELESS if len(hidden) == len(looks) else Severity.PROBLEM
             yield Finding(f"{_of(hidden, looks)} show nothing, as every pixel is left out by {cause}", remedy, severity)
-    yield from check_shared([look for look in looks[:LOOKED_AT] if not look.hidden_by], photos)
+    yield from check_shared([look for look in looks[:LOOKED_AT] if not look.hidden_by], Path(place))
 
 
 def check_shared(looks: Sequence[Look], photos: Path) -> Iterator[Finding]:

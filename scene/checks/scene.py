@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
-from groundwork.applications import has_application
 from groundwork.finding import Finding, Severity, from_error, note
 from scene.checks.cameras import check_cameras, check_extent, check_lens_shapes, check_lenses
 from scene.checks.conversion import check_conversion, describe_changed_photos, describe_left_out
@@ -40,7 +39,7 @@ def findings(
     info = info._replace(train_cameras=train, test_cameras=test)
     views = sorted((*train, *test), key=lambda view: str(view.image_name))  # the same ones whatever is held out
     place = Path(getattr(options, "source_path", ""), getattr(options, "images", "images")).absolute()
-    photos = [*check_photos(views, most, alpha, *[place] * place.is_dir()), *check_duplicates(info, halves)]
+    photos = [*check_photos(views, most, alpha, *[str(place)] * place.is_dir()), *check_duplicates(info, halves)]
     found = [*check_cameras(info), *photos, *([] if has_shared_pixels(photos) else check_points(info))]
     return sorted(found, key=lambda one: -one.severity)
 
@@ -59,8 +58,7 @@ def report(found: list[Finding], source: str | os.PathLike, quiet: bool = False)
     for one in found[:_LINES]:
         print(f"warning: {one}", file=sys.stderr)
     if len(found) > _LINES:
-        command = f": python doctor.py -s {source}" if has_application("doctor") else ""
-        print(f"{len(found) - _LINES} more{command}", file=sys.stderr)
+        print(f"{len(found) - _LINES} more: python doctor.py -s {source}", file=sys.stderr)
 
 
 def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:

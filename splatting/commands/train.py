@@ -114,9 +114,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     if dataset.source_path and awaits_conversion(dataset.source_path):
-        conversion = application("convert", "command")
         _check_places(dataset, args)
-        conversion.convert_first(dataset.source_path)
+        application("convert", "command").convert_first(dataset.source_path)
     if args.advise or args.options == "auto":
         given = sys.argv[1:] if argv is None else argv
         words = application("doctor", "advice").asked_options(resolve_lenses(dataset, None), args, given)
