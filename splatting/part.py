@@ -242,7 +242,7 @@ class Part:
 
         If so, all earlier steps are done by the time of `measured`, and every loss so far is checked first. If no part
         says so, the GPU may be some steps behind in `measured` and `stepped`: tensors that these hooks get may be kept,
-        but not read.
+        but not read. A part that reads losses alone sets at.due and returns false: blocks of rows then sleep on.
         """
         raise NotImplementedError
 

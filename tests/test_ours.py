@@ -189,7 +189,7 @@ def test_a_record_of_others_leads_to_no_other_folder(tmp_path):
 def test_figures_go_by_no_settings_of_the_current_folder(tmp_path):
     pytest.importorskip("matplotlib")
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\n")
-    code = "from splatting.records.figures import _figure\nfrom matplotlib import rcParams\n"
-    code += "assert rcParams['text.usetex']\n_figure(1, (2, 2), '')\nassert not rcParams['text.usetex']"
+    code = "from splatting.records.figures import make_figure\nfrom matplotlib import rcParams\n"
+    code += "assert rcParams['text.usetex']\nmake_figure(1, (2, 2), '')\nassert not rcParams['text.usetex']"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)
