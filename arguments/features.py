@@ -1,4 +1,4 @@
-"""The options of features (splatting/features): a table by the name of the feature, in the order of the registry."""
+"""The options of features (splatting/features), in the order of the registry, and of observers: a table by name."""
 
 import argparse
 from dataclasses import dataclass

@@ -20,6 +20,7 @@ from groundwork.ranks.rows import BLOCK, PIECE
 from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.spilled import is_spilled, to_host
+from scene.in_view import share_of
 from utils.system_utils import UserError
 
 REST = 100  # iterations
@@ -28,6 +29,11 @@ _TERMS = 128, 8  # of past steps, for each attribute (gs::SleepInput)
 _NAMES = "xyz", "opacity", "scaling", "rotation", "f_dc", "f_rest"  # in the order of gs::Stepped
 
 State = dict[str, Any]  # awake, taken and terms, and of the rows that sleep all that a step changes
+
+
+def saves_time(scene: Any, device: torch.device) -> bool:
+    """Tell whether views of a scene see so few of its points that blocks should sleep."""
+    return share_of(scene, device) < MOST_SHARE
 
 
 class Sleeping:
@@ -65,6 +71,15 @@ class Sleeping:
     def stepped(self) -> None:
         """Note that a step was taken, or taken back: blocks that sleep have then missed steps."""
         self._is_whole = False
+
+    def after_step(self, iteration: int, changes: bool) -> None:
+        """Note the step of an iteration. changes: rows or views have changed, so that all blocks were awake."""
+        if changes:
+            self.reset()
+        elif self.flushes(iteration):
+            self.flush()
+        else:
+            self.stepped()
 
     def flushes(self, iteration: int) -> bool:
         """Tell whether all blocks wake after the step of an iteration."""
@@ -141,7 +156,7 @@ class Sleeping:
     def _copied(self) -> list[Tensor]:
         """Copy the values and averages of the sleeping rows; to the host if the device has no memory left."""
         rows, moved = self._sleepers(), self._moved()
-        if not any(map(is_spilled, moved)):
+        if not (self._gaussians.storage and any(map(is_spilled, moved))):
             with suppress(torch.OutOfMemoryError):
                 return [values[rows] for values in moved]
         return [to_host(values, rows) for values in moved]

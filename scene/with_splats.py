@@ -78,9 +78,11 @@ def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
 
 
 def scene_with(
-    path: str, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
+    path: str | None, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
 ) -> tuple[Scene, Splats | None]:
     """Make a scene whose points are a file's, and return its splats in the scene's frame, None for a point cloud.
+
+    Without a file, the points are the dataset's.
 
     The model stays empty. Positions in the file are the world's, unless our comment world_offset has their origin.
     UserError for a file without splats that are drawn, and as from Scene.
@@ -88,10 +90,13 @@ def scene_with(
     options: the model options.
     of_scene: further arguments of Scene.
     """
+    of_scene |= {"shuffle": False, "start": False}
+    if not path:
+        return Scene(options, gaussians, **of_scene), None
     options = copy.copy(options)
     if is_point_cloud(path):
         options.init_pcd_path = path
-        return Scene(options, gaussians, shuffle=False, start=False, **of_scene), None
+        return Scene(options, gaussians, **of_scene), None
     splats = splats_in(path)
     splats = selected(splats, drawable(splats))
     if not len(splats):
@@ -100,7 +105,7 @@ def scene_with(
     colors = np.clip(base_colors(splats), 0, 1)
     # The scene moves them into its frame, as it does any points.
     options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
-    scene = Scene(options, gaussians, shuffle=False, start=False, **of_scene)
+    scene = Scene(options, gaussians, **of_scene)
     if splats.enlargement != 1:  # as the file says, which is that of its training
         gaussians.enlargement = splats.enlargement
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)

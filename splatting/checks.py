@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from arguments.features import FEATURES
+from groundwork.applications import application
 from groundwork.finding import Finding, Severity
 from groundwork.host.listing import some
 from scene.checks.conversion import has_undistorted_photos
@@ -23,12 +24,22 @@ LATE_RESET = "opacities are reset"  # how the text of a late reset begins
 STEP_ALONE, STEP_SHARED = (0.9, 1.25), (2.8, 0.87)
 
 
-def check_alone(projection: str, several: bool) -> None:
-    """Refuse --projection ray in a training of several processes (UserError)."""
-    if several and projection == "ray":
-        raise UserError(
-            "--projection ray needs a training of one process; leave it out, or start train.py without torchrun"
-        )
+def check_alone(pipe: argparse.Namespace, launch: argparse.Namespace, several: bool) -> None:
+    """Refuse options that need one process in a training of several (UserError)."""
+    given = {
+        "--projection ray": getattr(pipe, "projection", "ewa") == "ray",
+        "--viewer": launch.viewer is not None or launch.paused,
+    }
+    if several and (option := next((option for option, there in given.items() if there), None)):
+        raise UserError(f"{option} needs a training of one process; leave it out, or start train.py without torchrun")
+
+
+def check_viewer(launch: argparse.Namespace) -> None:
+    """Refuse a page that cannot be served (UserError)."""
+    if launch.viewer is not None:
+        application("viewer", "server").check_port(launch.viewer)
+    elif launch.paused:
+        raise UserError("--paused needs --viewer, whose page lets the training go on")
 
 
 def check_native(options: argparse.Namespace) -> None:
@@ -54,7 +65,6 @@ def warnings_of(run: Any, given: argparse.Namespace) -> Iterator[Finding]:
         faster_alone(run.group.size, run.device.type == "cuda", expected),
         late_reset(density, opt, done),
         without_effect(given, opt.strategy),
-        another_number(density, opt, count, done + 1),
     )
     yield from filter(None, found)
 
@@ -90,7 +100,7 @@ def late_reset(density: Strategy, opt: argparse.Namespace, done: int) -> Finding
     if schedule.paced:
         return None
     last = range(max(done, schedule.ends - rules.RECOVERY) + 1, schedule.ends)
-    if not (due := [iteration for iteration in last if density.resets(iteration)]):
+    if not (due := [iteration for iteration in last if density.actions(iteration).reset_opacity]):
         return None
     of_white = schedule.schedule_step(due[-1]) % opt.opacity_reset_interval > 0
     remedy = "raise --opacity_reset_interval"
@@ -98,53 +108,6 @@ def late_reset(density: Strategy, opt: argparse.Namespace, done: int) -> Finding
         remedy = "lower --densify_from_iter, at which a white background resets opacities"
     left = f"the remaining {schedule.ends - due[-1]} iterations are too few to recover"
     return Finding(f"{LATE_RESET} in iteration {due[-1]}, and {left}", remedy)
-
-
-def another_number(density: Strategy, opt: argparse.Namespace, count: int, first: int) -> Finding | None:
-    """Return a warning if a strategy cannot reach its number of Gaussians in time, or None.
-
-    The number that a run with a time budget will reach is not known, so there is no warning either.
-
-    count: present number of Gaussians.
-    first: the next iteration.
-    """
-    schedule, aim = density.schedule, density.max_gaussians
-    if schedule.paced or schedule.schedule_step(first) >= density.ends > 0:
-        return None  # what is repeated or resumed has no say in it any more
-    ending, start = density.until[0], f"--densify_from_iter {opt.densify_from_iter} is not before"
-    if 0 < density.ends <= opt.densify_from_iter < schedule.length:
-        return Finding(f"{start} --{ending} {density.ends}, so no Gaussians are added", "lower --densify_from_iter")
-    reached = density.projected_count(count, first, schedule.ends)
-    too_many, too_late = 0 < opt.max_num_splats < count, opt.densify_from_iter >= schedule.length
-    remover = next((strategy.name for strategy in strategies() if strategy.removes), None)
-    if not density.grows_to:
-        remedy = f"--strategy {remover} removes the surplus" if remover and not too_late else ""
-        text = f"{_start_of(count, opt)}; {opt.strategy} adds none, and removes only faint ones"
-        return Finding(text, remedy) if too_many else None
-    if reached == aim or ((reached > aim or density.default_is_limit) and not opt.max_num_splats):
-        return None
-    done = schedule.schedule_step(first) - 1
-    # Half of what is left suits rules that need the rest to settle, as those that end late by default do not.
-    ends = f"--{ending} {done + (schedule.length - done) // 2}" if density.until[1] == 1 / 2 else ""
-    scaled = None
-    if not done and opt.densify_from_iter < density.ends < schedule.usual and hasattr(opt, "schedule"):
-        scaled = f"--schedule {schedule.length} in place of --iterations {schedule.length}"
-    if too_late:
-        window = f"--densify_from_iter {done + (schedule.length - done) // 20} {ends}".rstrip()
-        why = f"{start} the end; give {scaled or window}"
-        if too_many and density.removes:
-            return Finding(_start_of(count, opt), f"only faint ones are removed, as {why}")
-    elif too_many and not density.removes:
-        why = f"it removes none; --strategy {remover} does"
-    elif ends and schedule.length < density.ends:
-        why = f"--{ending} {density.ends} is not before the end; give {scaled or ends}"
-    else:
-        why = density.too_slow()
-    return Finding(f"--strategy {opt.strategy} will reach {reached:,} Gaussians, not {aim:,}, as {why}")
-
-
-def _start_of(count: int, opt: argparse.Namespace) -> str:
-    return f"training starts with {count:,} Gaussians, more than --max_num_splats {opt.max_num_splats}"
 
 
 def check_overfitting(rows: Sequence[Row], records: Sequence[Mapping[str, Any]]) -> Iterator[Finding]:

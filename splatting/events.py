@@ -6,10 +6,13 @@ from functools import partial
 from io import BytesIO
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from splatting.iteration import Iteration, Losses
+from splatting.part import Part
 
 INTERVAL = 10  # iterations between losses: reading one waits for the GPU
 _FLUSHED = 10  # seconds until events are in the file at the latest
@@ -48,6 +51,28 @@ class Events:
 
     def _scalar(self, tag: str, value: float) -> None:
         self._writer.add_scalar(tag, value, self._iteration)
+
+
+class LossEvents(Part):
+    """Writes the losses of every tenth iteration, except testing ones, in which `training_report` writes them."""
+
+    def __init__(self, run: Any) -> None:
+        self._run = run
+        self._kept: list[tuple] = []
+
+    def measured(self, at: Iteration, losses: Losses) -> None:
+        if at.iteration % INTERVAL == 0 and not at.takes(self._run.launch.test_iterations):
+            self._kept.append((at.iteration, losses.l1, losses.total, self._run.clock.seconds - at.started))
+        if at.due and self._kept:
+            with self._run.clock.paused("scoring"):
+                self._write()
+
+    def _write(self) -> None:
+        """Write the losses that are kept, and wait for the GPU once, not once for each loss."""
+        kept, self._kept = self._kept, []
+        values = torch.stack([loss.detach() for _, *pair, _ in kept for loss in pair]).cpu().view(-1, 2)
+        for (iteration, *_, seconds), (l1, total) in zip(kept, values, strict=True):
+            Events(self._run.writer, iteration).losses(l1, total, seconds)
 
 
 class EventWriter:

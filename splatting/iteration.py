@@ -8,6 +8,7 @@ from torch import Tensor
 
 from groundwork.deterministic.counter_rng import Stream, permutation
 from scene.cameras import Camera
+from scene.gaussians.density_rules import Actions
 from utils.system_utils import UserError
 
 # Scalar of a render's package and of the mask of the pixels that count, (1, H, W) bool or None.
@@ -30,15 +31,16 @@ class Losses(NamedTuple):
 
 @dataclass(slots=True)
 class Iteration:
-    """An iteration, counted from 1. `Run.iterations` makes it; the last five fields are set while it runs."""
+    """An iteration, counted from 1. `Run.iterations` makes it; the last fields are set while it runs."""
 
     iteration: int
     last: bool  # nothing comes after it, so it takes no step
     camera: Camera
     background: Tensor  # (3,), random or that of the scene
-    changes: bool  # rows of the Gaussians, the SH degree or the size of views change in this iteration
+    changes: bool  # rows of the Gaussians, the SH degree or the size of views may change
     started: float  # seconds of training before it
     span: range  # steps of the schedule that it stands for (splatting/schedule.py); of the last, all that are left
+    density: Actions = Actions()  # what density control does in it
     rests: bool = False  # an earlier run ended with it, and took no step
     terms: dict[str, Term] = field(default_factory=dict)  # that parts add to the loss, weights included
     captured: bool = True  # a captured step may record the terms
@@ -66,6 +68,10 @@ class OwnSize:
     """The default of the slot run.sizes: all views have their own size in all iterations."""
 
     factor = 1.0  # by which the last view was made smaller
+
+    def factor_at(self, schedule_step: int) -> float:
+        """Return the factor at an iteration of the schedule."""
+        return 1.0
 
     def view(self, camera: Camera, schedule_step: int) -> Camera:
         """Return a view in the size in which it is trained at an iteration of the schedule."""

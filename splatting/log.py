@@ -9,7 +9,7 @@ from splatting.checks import STRATEGY, check_overfitting
 from splatting.folder import view_command
 from splatting.iteration import Iteration, Losses
 from splatting.objective import LossWatch
-from splatting.part import Error, Part, overrides
+from splatting.part import Error, Part
 from splatting.records.error_curve import whole_sets
 from splatting.run import Run
 
@@ -22,8 +22,6 @@ BAR_SECONDS = 0.2  # between updates, at least: each reads the losses, and so wa
 class ProgressBar(Part):
     """Shows running means of the loss and of the parts' terms, and prints at the end how long the training took."""
 
-    reads_model = False
-
     def __init__(self, run: Run) -> None:
         self._run = run
         self._shown = {"Loss": run.losses}
@@ -34,7 +32,8 @@ class ProgressBar(Part):
 
     def due(self, at: Iteration) -> bool:
         shown = at.iteration % BAR_INTERVAL == 0 and time.monotonic() - self._updated >= BAR_SECONDS
-        return at.last or shown
+        at.due |= at.last or shown
+        return False  # it reads losses, and not the model, whose blocks may sleep on
 
     def measured(self, at: Iteration, losses: Losses) -> None:
         for name, term in losses.terms.items():
@@ -106,7 +105,7 @@ class Records(Part):
         run = self._run
         if at.record is None and at.scored_at is None:
             return
-        added = {name: number for add in overrides(run.parts, "records") for name, number in add().items()}
+        added = {name: number for part in run.parts for name, number in part.records().items()}
         if at.record is None and not added:
             return
         self._seconds = seconds = run.clock.seconds if at.scored_at is None else at.scored_at

@@ -9,12 +9,17 @@ from torch import Tensor
 
 from gaussian_renderer import apply_trained_exposure, draw, render, to_world_units, wake
 from gaussian_renderer.memory_errors import explain_memory_errors
+from groundwork.applications import application
 from splatting.agreement import StepAgreement
+from splatting.curve import Curve
+from splatting.events import LossEvents
 from splatting.faster import FasterSteps, faster_steps
 from splatting.iteration import Iteration, Losses
 from splatting.log import ProgressBar, Records, Summary
-from splatting.part import Error, Part, overrides
-from splatting.run import Run
+from splatting.part import Error, Part
+from splatting.remote_viewer import RemoteViewer
+from splatting.resume import Resume
+from splatting.run import Run, overrides
 from splatting.save import Saves
 from splatting.scores import Scores, training_report
 from splatting.watch import MaskWatch
@@ -76,6 +81,7 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
             try:
                 for at in run.iterations():  # a view in the order of the seed, its background, terms of the loss
                     tell.begins(at)  # who reads or writes the model in it?
+                    barrier.begins(at)
                     faster.throttle(at)  # before the learning rates are set, which a replayed step changes
                     run.prepare(at)  # learning rates, SH degree, photos of the next views
                     if not faster.take(at, tell):
@@ -100,21 +106,36 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
 
 
 def standard_observers(run: Run) -> list[Part]:
-    """Return the observers of every training, and among them, in their places, the parts of the run."""
+    """Return the observers of every training, and among them, in their place, the parts of the run."""
+    last = _last_observers(run)  # which print, so that they are made before the progress bar
     if run.report is not training_report:
         run.stop_skipping()  # it may read or change the model in every iteration
     return [
         run.watch,  # first: observers that write rely on all losses so far being finite
         *([ProgressBar(run)] if run.group.first else []),  # reads the losses that the watch has checked
         MaskWatch(run.scene.getTrainCameras()),  # may refuse the scene before anything is written
-        *(part for part in run.parts if not part.told_last),
+        *([] if run.launch.no_curve or not run.scene.getTestCameras() else [Curve(run)]),  # scores what is saved now
+        *run.parts,
+        *([LossEvents(run)] if run.writer is not None and run.report is training_report else []),
         Scores(run),
         Saves(run),  # before the model changes
         Records(run),  # after all that add to the iteration's record
         Summary(run),  # after all that say something at the end
         run.checkpoints,  # writes the whole state after the step
-        *(part for part in run.parts if part.told_last),
+        *last,
     ]
+
+
+def _last_observers(run: Run) -> list[Part]:
+    """Return the observers that may let the training wait, when all else of an iteration is done and written."""
+    last: list[Part] = [Resume(run)]
+    if RemoteViewer.suits(run):
+        last.append(RemoteViewer(run))
+    if run.launch.viewer is not None:
+        page = application("viewer", "training_page").TrainingPage(run)
+        run.resources.callback(page.close)
+        last.append(page)  # its pause is of all else
+    return last
 
 
 class Announcer:
@@ -126,18 +147,15 @@ class Announcer:
         flushed: context in which parts are called in an iteration in which they read the model.
         """
         self._flushed = flushed
-        self._begins, self._measured, self._stepped, self._ended = (
-            overrides(parts, hook) for hook in ("begins", "measured", "stepped", "ended")
+        self._due, self._measured, self._stepped, self._ended = (
+            overrides(parts, hook) for hook in ("due", "measured", "stepped", "ended")
         )
-        self._due = [(due, due.__self__.reads_model) for due in overrides(parts, "due")]
 
     def begins(self, at: Iteration) -> None:
+        at.due = at.changes
         # A list, so that each part is asked in every iteration, whatever the others answer.
-        due = [(due(at), reads) for due, reads in self._due]
-        at.due = at.changes or any(is_due for is_due, _ in due)
-        at.read = any(is_due and reads for is_due, reads in due)
-        for notify in self._begins:
-            notify(at)
+        at.read = any([due(at) for due in self._due])
+        at.due |= at.read
 
     def measured(self, at: Iteration, losses: Losses) -> None:
         with self._flushed() if at.read else nullcontext():

@@ -6,22 +6,15 @@ from typing import Any
 
 from splatting.features.adc import Adc
 from splatting.features.budget import Budget
-from splatting.features.curve import Curve
 from splatting.features.depths import Depths
 from splatting.features.exposure import Exposure
 from splatting.features.mcmc import Mcmc
 from splatting.features.ppisp import Ppisp
 from splatting.features.refine_poses import RefinePoses
-from splatting.features.remote_viewer import RemoteViewer
-from splatting.features.resume import Resume
 from splatting.features.robust_mask import RobustMask
 from splatting.features.sky import Sky
-from splatting.features.sleep import Sleep
 from splatting.features.sparse_depth import SparseDepth
-from splatting.features.spill import Spill
-from splatting.features.tensorboard import Tensorboard
 from splatting.features.time_budget import TimeBudget
-from splatting.features.viewer import Viewer
 from splatting.part import Appearance, Part, Strategy
 from utils.system_utils import UserError
 
@@ -31,7 +24,6 @@ PARTS: tuple[type[Part], ...] = (
     Exposure,  # adds training views before anything moves them
     RefinePoses,  # its cameras stand right before anything asks where they are
     Depths,
-    Curve,  # its scores are those of the model that is saved in the same iteration
     RobustMask,
     Adc,  # the first strategy is the default
     Mcmc,  # before Budget: where a time is given, the first that is best in it is taken
@@ -39,12 +31,6 @@ PARTS: tuple[type[Part], ...] = (
     Sky,
     SparseDepth,  # the order of the terms of the loss is in the bytes of the model
     Ppisp,
-    Spill,  # after all that moves rows, and before Sleep, which pays where rows lie on the host
-    Sleep,  # after all that decides whether every step concerns all rows
-    Tensorboard,  # from here on, those that only watch
-    Resume,  # before all that may let the training wait
-    RemoteViewer,
-    Viewer,  # last: its pause is of all else
 )
 
 
@@ -67,6 +53,7 @@ def in_order(parts: Iterable[Part]) -> list[Part]:
     return sorted(parts, key=lambda part: names.index(part.name))
 
 
+OF_RUN = "sleep", "resume"  # states of a checkpoint that are of no part: blocks that sleep, and new photos
 EXPOSURES = "exposures"  # the model's own key of what an appearance has trained
 # Of states in checkpoints of 0.3 and before.
 _OLD_KEYS = {
@@ -87,7 +74,7 @@ def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     kinds = {part.kind: part.name for part in PARTS if issubclass(part, Appearance)}
     renamed = _OLD_KEYS | {EXPOSURES: kinds.get(checkpoint.get(EXPOSURES, {}).get("kind", "affine"), EXPOSURES)}
     named = {renamed.get(key, key): state for key, state in checkpoint.items()}
-    if unknown := sorted(map(str, named.keys() - {part.name for part in PARTS})):
+    if unknown := sorted(map(str, named.keys() - {part.name for part in PARTS}.union(OF_RUN))):
         raise UserError(
             f"the checkpoint has a state of {unknown[0]}, which this code does not have; use the code that wrote it, "
             "or start a new training from its PLY by --init_ply"
@@ -95,24 +82,31 @@ def states_in(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     return {name: state for name, state in named.items() if state is not None}
 
 
-def chosen(given: argparse.Namespace, states: Collection[str] = ()) -> list[Part]:
+def chosen(given: argparse.Namespace, states: Collection[str] = (), iteration: int = 0) -> list[Part]:
     """Make the parts that options ask for, and those that a state in a checkpoint brings in, in their order.
+
+    A strategy joins a run later (splatting/run.py).
 
     given: options of all groups.
     states: names of the parts that have a state in the checkpoint.
+    iteration: iteration of the checkpoint.
     """
-    return [part() for part in PARTS if part.wanted(given) or (part.by_state and part.name in states)]
+    others = [part for part in PARTS if not issubclass(part, Strategy)]
+    return [
+        part()
+        for part in others
+        if part.asked_by(given) or (part.name in states and part.joins_by_state(given, iteration))
+    ]
 
 
 def check_together(parts: Collection[Part], given: argparse.Namespace, several: bool) -> None:
     """Refuse a part that does not work with other options, or with several processes (UserError)."""
     for part in parts:
-        option = part.asked_by(given)
+        asked = part.asked_by(given)
+        option = asked or f"--{part.name}"
         if several and not part.needs.ranks:
-            remedy = "leave it out, or start train.py without torchrun"
-            if not part.wanted(given):
-                remedy = f"it is in {given.start_checkpoint}, so start train.py without torchrun"
-            raise UserError(f"{option} needs a training of one process; {remedy}")
+            remedy = "leave it out, or start" if asked else f"it is in {given.start_checkpoint}, so start"
+            raise UserError(f"{option} needs a training of one process; {remedy} train.py without torchrun")
         for other, reason in part.against.items():
             name, _, value = other.partition("=")
             there = getattr(given, name, None)

@@ -52,7 +52,8 @@ def announce_memory(
     why = "--max_num_splats" if max_splats else f"scenes often grow {GROWTH}-fold"
     per_rank = [-(-count // size) for count in (now, later)]
     at_start, at_end = (
-        training_bytes(gaussians, count, pixels, absolute) - space.host_bytes(count) for count in per_rank
+        training_bytes(gaussians, count, pixels, absolute) - (space.host_bytes(count) if space else 0)
+        for count in per_rank
     )
     training = f"{later:,} Gaussians ({why}) {gib(at_end)}"
     each = f" for each of {size} processes" if size > 1 else ""
@@ -67,13 +68,14 @@ def announce_memory(
             warn_of(images.keep_on, "all photos", "set --images_to_load, or lower --resolution (-r)")
         pictures = 0
     content = (f"{photos}, {training}" if together else training) + each
-    room = announce_device(device, content, pictures, pictures + at_end, space.limit)
+    room = announce_device(device, content, pictures, pictures + at_end, space.limit if space else 0)
     for count, own, needed, first in (
         (now, per_rank[0], at_start, "set "),
         (later, per_rank[1], at_end, "set a lower --max_num_splats, or "),
     ):
         if room < needed:
-            warn_of(device, f"{count:,} Gaussians", f"{space.remedy(own, needed - room)}{first}{REMEDY}")
+            option = space.remedy(own, needed - room) if space else ""
+            warn_of(device, f"{count:,} Gaussians", f"{option}{first}{REMEDY}")
             break
 
 

@@ -6,6 +6,8 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -21,212 +23,253 @@ from groundwork.files.similarity import ENTRY, read_orientation
 from groundwork.host.clock import seconds_since_start
 from groundwork.host.energy import joules_counter, nvml_name
 from groundwork.host.interrupt import DeferredInterrupt
-from groundwork.ranks.ranks import ranks
+from groundwork.ranks.ranks import Ranks, ranks
 from scene.checks.scene import check_scene
+from scene.fused_adam import FusedAdam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.sh_bands import SH_INTERVAL
 from scene.scene import Scene
-from scene.sleeping import Sleeping
+from scene.sleeping import Sleeping, saves_time
 from scene.splats.splats import Splats
 from scene.with_splats import scene_with, start_from
 from splatting import folder
 from splatting.agreement import agree_on_scene
-from splatting.checks import check_alone, check_native, warnings_of
+from splatting.checks import check_alone, check_native, check_viewer, warnings_of
 from splatting.iteration import Iteration, OwnSize, ViewOrder
 from splatting.objective import LossWatch, Objective
-from splatting.part import Part, Strategy, overrides
+from splatting.part import Part, Strategy
 from splatting.records.error_curve import Row
 from splatting.records.training_log import Stopwatch, TrainingLog
-from splatting.registry import PARTS, check_together, chosen, in_order, states_in, strategies, strategy_part
+from splatting.registry import check_together, chosen, in_order, states_in, strategies, strategy_part
 from splatting.resources import announce_memory
+from splatting.resume import warn_of_finished
+from splatting.resume_photos import order_views
 from splatting.save import Checkpoints
 from splatting.schedule import USUAL, Schedule
+from splatting.spill import announce, make_storage, release_torch
 from splatting.trim_report import TrimReport, trimmed
 from splatting.watch import DivergenceWatch, check_drawn
 from utils.system_utils import UserError, compute_device
 
 
+def make_run(
+    dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
+) -> "Run":
+    """Make a run of these options. Refuse what can be refused (UserError); nothing is written.
+
+    launch: the options of arguments/launch.py.
+    """
+    given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
+    group, device = ranks(), compute_device()
+    check_alone(pipe, launch, group.several)
+    start = group.broadcast_object(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
+    check_native(dataset)  # before auto becomes native
+    dataset = folder.resolve_lenses(dataset, start)
+    if opt.strategy == "auto" and start:
+        opt.strategy = folder.strategy_of(start)
+    gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
+    # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
+    capture, done = load_checkpoint(start, mapped=group.several) if start else (None, 0)
+    states = states_in(extra_state(capture)) if capture else {}
+    parts = chosen(together := _joined(launch, dataset, opt, pipe), states, done)
+    check_together(parts, together, group.several)
+    schedule = _make_schedule(parts, opt, start, done, states)
+    gaussians.storage = make_storage(gaussians, opt, device, any(one.takes_absolute(opt) for one in strategies()))
+    check_viewer(launch)
+    if schedule.is_over(done):
+        raise UserError(schedule.nothing_left(start, done))
+
+    init_ply = None if start else getattr(dataset, "init_ply", None)
+    scene, splats = scene_with(init_ply, dataset, gaussians, ranks=group, parts=parts)
+    gaussians.enlargement = folder.enlargement_of(start, gaussians.enlargement)
+    check_scene(scene, dataset, bool(start))
+    agree_on_scene(scene, start)  # before an image is shared
+    gaussians.divide(group)
+    if gaussians.storage:
+        rows = capture[1] if capture else scene.info.point_cloud.points if splats is None else splats
+        gaussians.storage.reserve(-(-len(rows) // group.size), scene)
+    views = ViewOrder(scene.getTrainCameras(), opt.seed)
+    run = Run(dataset, opt, pipe, launch, group, device, start, done, parts, schedule, scene, gaussians, views)
+    run.decode_ahead(done + 1)
+
+    _begin_model(run, capture, splats, states)
+    check_views(pipe, scene.getTrainCameras(), run.sizes.smallest)
+    check_views(pipe, scene.getTestCameras())
+    if capture is None:
+        check_drawn(run)
+    _compare_with_earlier_runs(run)
+    run.strategy = _begin_strategy(run, states)
+    run.objective = Objective(run)
+    run.warnings = [f"warning: {text}" for text in warnings_of(run, given)]
+    for text in run.warnings:
+        print(text, file=sys.stderr)
+    _place(run, states.get("sleep"))
+    warn_of_finished(run)
+    run.watch, run.checkpoints = DivergenceWatch(run), Checkpoints(run)
+    return run
+
+
+def _joined(*groups: argparse.Namespace) -> argparse.Namespace:
+    """Return the options of all groups; a later group goes before an earlier one."""
+    return argparse.Namespace(**{name: value for group in groups for name, value in vars(group).items()})
+
+
+def _make_schedule(
+    parts: Sequence[Part], opt: argparse.Namespace, start: str | None, done: int, states: dict[str, Any]
+) -> Schedule:
+    """Return the schedule of a part, or the steady one.
+
+    A paced run has few iterations, and needs the last ones to train the Gaussians that it has. So densification ends by
+    default at a part of the schedule, where it would end with the schedule.
+    """
+    found = [part.make_schedule(opt, start, done, states.get(part.name)) for part in parts]
+    schedule = next(filter(None, found), None) or Schedule(opt.iterations)
+    if schedule.paced:
+        for name, share in {strategy.until for strategy in strategies()}:
+            if getattr(opt, name) >= opt.iterations:
+                setattr(opt, name, int(share * opt.iterations))
+    return schedule
+
+
+def _begin_model(run: "Run", capture: tuple | None, splats: Splats | None, states: dict[str, Any]) -> None:
+    """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
+    scene, gaussians = run.scene, run.gaussians
+    if capture is not None:
+        gaussians.start_exposures(scene.info.train_cameras)
+        gaussians.restore(capture, run.opt)
+    elif splats is not None:
+        start_from(splats, scene, gaussians)
+    else:
+        scene.create_gaussians()
+        run.starts_from_points = True
+    for part in run.parts:
+        part.begin(run, states.get(part.name))
+    if capture is None:
+        gaussians.training_setup(run.opt)
+        sort_rows(gaussians)
+    run.parts = [part for part in run.parts if part.active]
+    order_views(run, states.get("resume"))
+    gaussians.limit_columns()
+
+
+def _compare_with_earlier_runs(run: "Run") -> None:
+    """Compare a run with earlier ones, in its folder and beside its checkpoint."""
+    saves, checkpoints = map(run.schedule.known, (run.launch.save_iterations, run.launch.checkpoint_iterations))
+    folder.check_folder(run.options, saves, run.start, run.first_iteration, checkpoints)
+    if run.start:
+        folder.report_changes(run.start, run.options, run.has_new_photos)
+
+
+def _begin_strategy(run: "Run", states: dict[str, Any]) -> Strategy:
+    """Choose the strategy by the option, the schedule or the model, and add it to the parts."""
+    opt = run.opt
+    if opt.strategy == "auto":
+        opt.strategy = run.schedule.best_strategy(run, strategies())
+    run.schedule.strategy = opt.strategy
+    strategy = strategy_part(opt.strategy)
+    run.parts = in_order([*run.parts, strategy])
+    check_together(run.parts, _joined(run.launch, run.options), run.group.several)
+    strategy.begin(run, states.get(strategy.name))
+    return strategy
+
+
+def _place(run: "Run", asleep: Any) -> None:
+    """Put cameras where they are trained, rows where there is room for those to come, and blocks to sleep.
+
+    asleep: state of the blocks in the checkpoint, or None.
+    """
+    strategy, gaussians, storage = run.strategy, run.gaussians, run.gaussians.storage
+    if run.camera_steps:
+        run.camera_steps.place()  # now that parts have measured where cameras were
+    if storage:
+        storage.reserve(-(-strategy.max_gaussians // run.group.size), run.scene)
+    dense = type(gaussians.optimizer) is GaussianAdam and FusedAdam.takes(gaussians)
+    if not dense or strategy.queues or any(strategy.penalty) or not run.is_standard:
+        return  # a step concerns rows that its view does not see
+    spills = run.group.any_rank(storage is not None and storage.limit > 0)
+    if spills or saves_time(run.scene, run.device):
+        run.sleeping = Sleeping(gaussians)
+        if asleep is not None:
+            run.sleeping.restore(asleep)
+
+
+@dataclass(eq=False)
 class Run:
     """The objects that the loop and its observers share, and the questions that an iteration asks about them.
 
     dataset, opt, pipe, launch: options.
-    scene, gaussians, objective, strategy, schedule: made by the options.
-    views: training cameras by iteration.
-    background: (3,), colour.
-    parts: parts of the run, in their order.
-    strategies: classes of all strategies that exist.
     group: processes that train together.
     start: path of the chkpntN.pth that is resumed, or None.
     first_iteration: number of iterations done before this run.
-    sleeping, sizes, pixel_filter, camera_steps, has_new_photos: slots that parts fill (splatting/part.py).
+    parts: parts of the run, in their order.
+    schedule: steps of the schedule that the iterations stand for.
+    views: training cameras by iteration.
+    starts_from_points: true if the Gaussians were made of the dataset's points.
+    added_photos: record of photos that an earlier run has not seen (splatting/resume_photos.py), or None.
+    has_new_photos: true if the checkpoint has not seen them.
+    sizes, pixel_filter, camera_steps: slots that parts fill (splatting/part.py).
+    sleeping: blocks of rows that take no step (scene/sleeping.py), or None.
     interrupt: signal that asks the loop to stop. An observer that waits has to check it.
-    resources: files and the like that parts have open, closed when the training is over, however it ends.
-    warnings: warnings that were printed.
-    log: training log.
-    rows: rows of the curve so far.
+    resources: files and the like that observers have open, closed when the training is over, however it ends.
     losses: running mean of the total loss.
-    clock: seconds of training. `open` starts log, rows, losses and clock, or continues those of a resumed run.
+    first_done: seconds from the process's start to the end of its first iteration; None: the system does not say.
+    strategy, objective: density control and loss.
+    warnings: warnings that were printed.
     watch: ends a training that diverges.
     checkpoints: writes checkpoints.
+    log: training log.
+    rows: rows of the curve so far.
+    clock: seconds of training. `open` makes log, rows and clock, which continue those of a resumed run.
     writer, report: arguments of `open`.
-    first_done: seconds from the process's start to the end of its first iteration; None: the system does not say.
     """
 
-    def __init__(
-        self, dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
-    ) -> None:
-        """Read and check everything that can be refused (UserError); nothing is written.
+    dataset: argparse.Namespace
+    opt: argparse.Namespace
+    pipe: argparse.Namespace
+    launch: argparse.Namespace
+    group: Ranks
+    device: torch.device
+    start: str | None
+    first_iteration: int
+    parts: Sequence[Part]
+    schedule: Schedule
+    scene: Scene
+    gaussians: GaussianModel
+    views: ViewOrder
+    starts_from_points: bool = False
+    added_photos: dict[str, Any] | None = None
+    has_new_photos: bool = False
+    sizes: Any = field(default_factory=OwnSize)
+    pixel_filter: Any = None
+    camera_steps: Any = None
+    sleeping: Sleeping | None = None
+    interrupt: DeferredInterrupt = field(default_factory=DeferredInterrupt)
+    resources: ExitStack = field(default_factory=ExitStack)
+    losses: LossWatch = field(default_factory=LossWatch)
+    first_done: float | None = None
+    strategy: Strategy = field(init=False)
+    objective: Objective = field(init=False)
+    warnings: list[str] = field(init=False)
+    watch: DivergenceWatch = field(init=False)
+    checkpoints: Checkpoints = field(init=False)
+    log: TrainingLog = field(init=False)
+    rows: list[Row] = field(init=False)
+    clock: Stopwatch = field(init=False)
+    writer: Any = None
+    report: Callable | None = None
 
-        launch: the options of arguments/launch.py.
-        """
-        given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
-        self.opt, self.pipe, self.launch = opt, pipe, launch
-        self.group = ranks()
-        check_alone(getattr(pipe, "projection", "ewa"), self.group.several)
-        self.start = self.group.broadcast_object(
-            folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations)
-        )
-        check_native(dataset)  # before auto becomes native
-        dataset = self.dataset = folder.resolve_lenses(dataset, self.start)
-        if opt.strategy == "auto" and self.start:
-            opt.strategy = folder.strategy_of(self.start)
-        self.resources = ExitStack()
-        self.interrupt, self.device = DeferredInterrupt(), compute_device()
-        self.gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-        capture, self.first_iteration = self._read_start()
-        self.schedule = Schedule(opt.iterations)
-        self._fill_slots()
-        states = self._choose_parts(capture)
-        self._orientation = read_orientation(Path(dataset.source_path))
-        if self.schedule.is_over(self.first_iteration):
-            raise UserError(self.schedule.nothing_left(self.start, self.first_iteration))
-        self.scene, first = self._read_scene()
-        self.gaussians.enlargement = folder.enlargement_of(self.start, self.gaussians.enlargement)
-        check_scene(self.scene, dataset, bool(self.start))
-        agree_on_scene(self.scene, self.start)  # before an image is shared
-        count = len(capture[1] if capture else self.scene.info.point_cloud.points if first is None else first)
-        self.gaussians.divide(self.group)
-        self.gaussians.storage.reserve(-(-count // self.group.size), self.scene)
-        self.views = ViewOrder(self.scene.getTrainCameras(), opt.seed)
-        self.decode_ahead(self.first_iteration + 1)
-        self.background = torch.full((3,), 1.0 if dataset.white_background else 0.0, device=self.device)
-        self._begin_model(capture, first, states)
-        check_views(self.pipe, self.scene.getTrainCameras(), self.sizes.smallest)
-        check_views(self.pipe, self.scene.getTestCameras())
-        if capture is None:
-            check_drawn(self)
-        self._check_records()
-        self.strategy = self._choose_strategy(states)
-        self.objective = Objective(self)
-        self.warnings = [f"warning: {text}" for text in warnings_of(self, given)]
-        for text in self.warnings:
-            print(text, file=sys.stderr)
-        for ready in self.each("ready"):
-            ready(self)
-        if capture is None and first is None:
-            self.strategy.started()
-        self._prepare_records()
-
-    def _fill_slots(self) -> None:
-        """Set the defaults of the slots that parts read and may fill."""
-        self.strategies = strategies()
-        self.parts: Sequence[Part] = ()
-        self._hooks: dict[str, list[Callable]] = {}
-        self.sleeping: Sleeping | None = None
-        self.sizes: Any = OwnSize()
-        self.pixel_filter = self.camera_steps = None
-        self.has_new_photos = False
-
-    def _prepare_records(self) -> None:
-        """Make the records of a new training. `open` replaces them where a training is resumed."""
-        self.log, self.clock, self.losses = TrainingLog(self.scene.model_path), Stopwatch(), LossWatch()
-        self.rows: list[Row] = []
-        self.watch, self.checkpoints = DivergenceWatch(self), Checkpoints(self)
-        self.writer = self.report = None
-        self.first_done: float | None = None
-
-    def _choose_parts(self, capture: tuple | None) -> dict[str, Any]:
-        """Choose the parts by options and checkpoint, and let the parts check both. Return the states by name."""
-        given, states = self._all_options, states_in(extra_state(capture)) if capture else {}
-        self.parts = chosen(given, states)
-        check_together(self.parts, given, self.group.several)
-        for part in PARTS:
-            dropped = part.name in states and part.name not in {there.name for there in self.parts}
-            if dropped and (text := part.dropped(given, self.first_iteration)):
-                print(f"warning: {text}", file=sys.stderr)
-        for check in self.each("check"):
-            check(self, states.get(check.__self__.name))
-        return states
-
-    def _read_start(self) -> tuple[tuple | None, int]:
-        """Return the state of the checkpoint that is resumed, on the host, and its iteration."""
-        # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
-        return load_checkpoint(self.start, mapped=self.group.several) if self.start else (None, 0)
-
-    def _read_scene(self) -> tuple[Scene, Splats | None]:
-        """Return the scene of the empty model, and the splats of --init_ply in the scene's frame, or None."""
-        init_ply = None if self.start else getattr(self.dataset, "init_ply", None)
-        options = {"ranks": self.group, "parts": self.parts}
-        if init_ply:
-            return scene_with(init_ply, self.dataset, self.gaussians, **options)
-        return Scene(self.dataset, self.gaussians, shuffle=False, start=False, **options), None
-
-    def _begin_model(self, capture: tuple | None, first: Splats | None, states: dict[str, Any]) -> None:
-        """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
-        if capture is not None:
-            self.gaussians.start_exposures(self.scene.info.train_cameras)
-            self.gaussians.restore(capture, self.opt)
-            for begin in self.each("begin"):
-                begin(self, states.get(begin.__self__.name))
-        else:
-            if first is None:
-                self.scene.create_gaussians()
-            else:
-                start_from(first, self.scene, self.gaussians)
-            for begin in self.each("begin"):
-                begin(self, None)
-            self.gaussians.training_setup(self.opt)
-            sort_rows(self.gaussians)
-        self.parts = [part for part in self.parts if part.active]
-        self._hooks.clear()
-        self.gaussians.limit_columns()
-
-    def _choose_strategy(self, states: dict[str, Any]) -> Strategy:
-        """Choose the strategy by the option, the schedule or the model, and add it to the parts."""
-        opt = self.opt
-        if opt.strategy == "auto":
-            opt.strategy = self.schedule.best_strategy(self)
-        self.schedule.strategy = opt.strategy
-        strategy = strategy_part(opt.strategy)
-        self.parts = in_order([*self.parts, strategy])
-        self._hooks.clear()
-        check_together(self.parts, self._all_options, self.group.several)
-        strategy.check(self, states.get(strategy.name))
-        strategy.begin(self, states.get(strategy.name))
-        if strategy.seen_only:
-            self.gaussians.step_sparsely()
-        return strategy
-
-    def _check_records(self) -> None:
-        """Compare this run with earlier runs, in its folder and beside its checkpoint."""
-        start = self.start
-        saves = [self.schedule.known(one) for one in (self.launch.save_iterations, self.launch.checkpoint_iterations)]
-        folder.check_folder(self.options, saves[0], start, self.first_iteration, saves[1])
-        if start:
-            folder.report_changes(start, self.options, self.has_new_photos)
-
-    @property
-    def _all_options(self) -> argparse.Namespace:
-        """The options of all groups, as they are in force, and of the launch, which may repeat them as given."""
-        return argparse.Namespace(**vars(self.launch) | vars(self.options))
+    def __post_init__(self) -> None:
+        white = 1.0 if self.dataset.white_background else 0.0
+        self.background = torch.full((3,), white, device=self.device)
+        self._orientation = read_orientation(Path(self.dataset.source_path))  # which may be gone later
 
     @property
     def options(self) -> argparse.Namespace:
         """The options of the groups model, optimisation and pipeline, as they are in force."""
-        return argparse.Namespace(**vars(self.dataset) | vars(self.opt) | vars(self.pipe))
+        return _joined(self.dataset, self.opt, self.pipe)
 
     @property
     def entries(self) -> dict[str, Any]:
@@ -236,7 +279,7 @@ class Run:
     @property
     def facts(self) -> dict[str, Any]:
         """Entries of model.json by parts, and where the scene stands upright, for exports (convert.py --orient)."""
-        found = {name: fact for facts in self.each("facts") for name, fact in facts().items()}
+        found = {name: fact for part in self.parts for name, fact in part.facts().items()}
         return found | ({ENTRY: self._orientation} if self._orientation else {})
 
     def open(self, writer: Any = None, report: Callable | None = None) -> None:
@@ -251,18 +294,23 @@ class Run:
             self.scene.write_inputs()
         if self.group.first and not self.schedule.paced:
             (Path(to) / SCHEDULE).unlink(missing_ok=True)
-        wants = self.strategy.max_gaussians, self.strategy.absolute_gradients
+        wants = self.strategy.max_gaussians, self.strategy.takes_absolute(self.opt)
         announce_memory(self.scene, self.gaussians, *wants, self.group.size)
         self.log, self.rows = folder.continue_records(to, start, self.first_iteration)
         self.losses.mean = self.log.loss
         self.clock = Stopwatch(joules_counter(self.group.all_gather_objects(nvml_name(self.device))))
-        for opened in self.each("opened"):
-            opened(self)
+        if storage := self.gaussians.storage:
+            announce(self, storage)
+            storage.rebalance(self.gaussians)
+            self.resources.callback(release_torch)
+        if writer is not None:
+            self.resources.callback(writer.close)
 
     def checkpoint_state(self) -> tuple:
         """Return the state of model and parts from which a training resumes. Every rank must call it."""
         state = self.gaussians.capture()
         states = {part.name: part.state() for part in self.parts}
+        states |= {"sleep": self.sleeping and self.sleeping.captured(), "resume": self.added_photos}
         return with_extra_state(state, {key: found for key, found in states.items() if found is not None})
 
     def save_last(self, iteration: int, scored: bool) -> TrimReport:
@@ -278,11 +326,13 @@ class Run:
 
     # What an iteration asks
 
-    def each(self, hook: str) -> list[Callable]:
-        """Return the parts' bound hooks of a name."""
-        if hook not in self._hooks:
-            self._hooks[hook] = overrides(self.parts, hook)
-        return self._hooks[hook]
+    @cached_property
+    def _terms(self) -> list[Callable]:
+        return overrides(self.parts, "terms")
+
+    @cached_property
+    def _after_step(self) -> list[Callable]:
+        return overrides(self.parts, "after_step")
 
     @property
     def is_standard(self) -> bool:
@@ -300,15 +350,17 @@ class Run:
             schedule.reach(iteration, self.log.seconds_before + seconds)
             camera = self.sizes.view(self.views[iteration], schedule.schedule_step(iteration))
             span, last = schedule.span(iteration), schedule.is_last(iteration)
+            density = self.strategy.actions(iteration)
             at = Iteration(
                 iteration,
                 last=last,
                 rests=schedule.rests(iteration),
                 camera=camera,
                 background=self._background(iteration),
-                changes=self._changes(iteration),
+                changes=density.changes or self._changes(iteration),
                 started=seconds,
                 span=range(span.start, schedule.length + 1) if last else span,
+                density=density,
             )
             self.add_terms(at)
             yield at
@@ -319,15 +371,16 @@ class Run:
 
     def add_terms(self, at: Iteration) -> None:
         """Add the terms of parts to the loss of a step."""
-        for terms in self.each("terms"):
+        for terms in self._terms:
             if found := terms(at):
                 at.terms |= found
                 at.wants_depth |= terms.__self__.needs.depth
                 at.captured &= terms.__self__.needs.captured
 
     def _changes(self, iteration: int) -> bool:
-        changes = any(changes(iteration) for changes in self.each("changes"))
-        return self._raises_degree(iteration) > 0 or changes
+        """Tell whether an iteration has a higher SH degree, or other sizes of views, than the one before it."""
+        before, now = (self.sizes.factor_at(self.schedule.schedule_step(t)) for t in (iteration - 1, iteration))
+        return before != now or self._raises_degree(iteration) > 0
 
     def _raises_degree(self, iteration: int) -> int:
         """Count the raises of the SH degree in an iteration; in a long steady run also those beyond the highest degree.
@@ -360,17 +413,16 @@ class Run:
 
     def set_rates(self, at: Iteration) -> None:
         """Set the learning rates of a step, which may be a repeated one."""
-        self.gaussians.exposures.held = self.strategy.recovers(at.iteration)
+        self.gaussians.exposures.held = at.density.recovers
         self.gaussians.update_learning_rate(self.schedule.schedule_step(at.iteration))
-        factor, bands = self.schedule.rate_factor(at.iteration), self.strategy.band_rate
-        if factor is None:
-            factor = self.strategy.rate_factor(at.iteration)
-        if factor is not None:
-            sparse = isinstance(self.gaussians.optimizer, SparseGaussianAdam)
-            factor *= bias_correction(at.iteration) if sparse else 1.0
+        factor, bands, beta2 = self.strategy.rates(at.iteration)
+        if (scheduled := self.schedule.rate_factor(at.iteration)) is not None:
+            factor = scheduled
+        optimizer = self.gaussians.optimizer
+        if factor is not None and isinstance(optimizer, SparseGaussianAdam):
+            factor *= bias_correction(at.iteration)
         if factor is not None or bands != 1:
             self.gaussians.scale_rates(1.0 if factor is None else factor, bands)
-        beta2, optimizer = self.strategy.beta2(at.iteration), self.gaussians.optimizer
         if beta2 is not None and isinstance(optimizer, GaussianAdam):
             optimizer.set_beta2(beta2)
 
@@ -391,9 +443,14 @@ class Run:
         self.camera_steps.place()
 
     def after_step(self, at: Iteration) -> None:
-        """Let parts act after the optimiser's step."""
-        for after_step in self.each("after_step"):
-            after_step(at)
+        """Let parts act after the optimiser's step, then the storage of rows, and the blocks that sleep."""
+        for act in self._after_step:
+            act(at)
+        if at.changes and self.gaussians.storage:
+            self.gaussians.storage.rebalance(self.gaussians)
+        if self.sleeping is not None:
+            self.gaussians.optimizer.rows = None
+            self.sleeping.after_step(at.iteration, at.changes)
 
     def flushed_view(self) -> AbstractContextManager:
         """Return a context in which others may read the model."""
@@ -411,9 +468,15 @@ class Run:
             "want_depth": at.wants_depth,
             "want_visibility": False,
             "want_inactive_bands": False,
-            "want_absolute_gradient": self.strategy.absolute_gradients and self.strategy.observes(at.iteration),
+            "want_absolute_gradient": at.density.observe and self.strategy.takes_absolute(self.opt),
             "clamp": False,
         }
+
+
+def overrides(parts: Sequence[Part], hook: str) -> list[Callable]:
+    """Return the bound hooks of the parts whose class overrides a hook."""
+    plain = getattr(Part, hook)
+    return [getattr(part, hook) for part in parts if getattr(type(part), hook) is not plain]
 
 
 def bias_correction(step: int, beta1: float = 0.9, beta2: float = 0.999) -> float:

@@ -8,10 +8,7 @@ iterations and still goes through the whole schedule: by the clock, or as a file
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from splatting.run import Run
+from typing import Any
 
 USUAL = 30_000  # iterations that the default learning rates are for
 LONGER = 2.0  # times the root of the stride
@@ -26,7 +23,6 @@ class Schedule:
     length: length of the schedule, in iterations.
     ends: last iteration of the run, None: not known yet.
     strategy: strategy in force (--strategy).
-    usual: iterations that the default learning rates are for.
     paced: true if iterations stand for more or fewer steps than one.
     by_clock: true if that follows the seconds that pass.
     seconds: seconds that the run may take, 0: any number.
@@ -35,7 +31,6 @@ class Schedule:
     """
 
     strategy = ""
-    usual = USUAL
     paced = False
     by_clock = False
     seconds = until = 0.0
@@ -104,9 +99,9 @@ class Schedule:
         """
         return limit
 
-    def best_strategy(self, run: "Run") -> str:
-        """Return the strategy of a new run that names none: the first in the registry."""
-        return run.strategies[0].name
+    def best_strategy(self, run: Any, strategies: Sequence[Any]) -> str:
+        """Return the strategy of a new run that names none: the first of all."""
+        return strategies[0].name
 
     def nothing_left(self, checkpoint: str, iteration: int) -> str:
         """Say why a run that would resume a checkpoint has nothing to do."""

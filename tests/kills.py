@@ -33,7 +33,7 @@ import torch
 import train
 import utils.system_utils
 from scene.readers.point_cloud import write_point_cloud
-from splatting.features import resume
+from splatting import resume
 
 sys.path.insert(0, str(Path(__file__).parent))
 from synthetic import make_blender_scene  # noqa: E402

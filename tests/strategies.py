@@ -25,14 +25,20 @@ def begun(
     extent: float = 1.0,
     cameras: Sequence[Any] = (),
     parts: Sequence[Any] = (),
+    starts: bool = False,
 ) -> Strategy:
-    """The strategy of this name in a run of a model (None: of one that has no rows), of these cameras and parts."""
+    """The strategy of this name in a run of a model (None: of one that has no rows), of these cameras and parts.
+
+    starts: the model is made of points.
+    """
     info = SimpleNamespace(ply_path=None)
     run = SimpleNamespace(
-        gaussians=gaussians or SimpleNamespace(shards=WHOLE, exposures=Exposures(), enlargement=1.0),
+        gaussians=gaussians
+        or SimpleNamespace(shards=WHOLE, exposures=Exposures(), enlargement=1.0, step_sparsely=lambda: None),
         opt=opt or options(),
         pipe=None,
         parts=parts,
+        starts_from_points=starts,
         schedule=schedule,
         dataset=SimpleNamespace(white_background=white),
         scene=SimpleNamespace(cameras_extent=extent, info=info, getTrainCameras=lambda: cameras),

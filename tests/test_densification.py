@@ -248,9 +248,10 @@ def test_a_reset_with_less_than_half_an_interval_to_go_is_left_out(changes, whit
     opt = options(**changes)
     control = begun("adc", model(4), opt, Schedule(opt.iterations), white=white)
     every = range(1, changes["iterations"])
-    assert [t for t in every if control.resets(t)] == kept
+    assert [t for t in every if control.actions(t).reset_opacity] == kept
     regular = [t for t in kept if t != opt.densify_from_iter]
-    assert [t for t in every if control.recovers(t) and not control.recovers(t - 1)] == regular
+    recovers = {t for t in every if control.actions(t).recovers}
+    assert sorted(t for t in recovers if t - 1 not in recovers) == regular
     left = changes["iterations"] - kept[-1] if kept else rules.RECOVERY
     assert (late_reset(control, opt, 0) is None) == (left >= rules.RECOVERY)
 
@@ -259,7 +260,7 @@ def test_a_run_by_the_clock_recovers_from_no_reset_that_it_leaves_out():
     """3,000 steps in 300 iterations: too few for a reset."""
     schedule = DecidedSchedule(Decided(30_000, [Block(3000, 0.0, 1 / 3000, 0.0)], 3000, 9.0))
     control = begun("adc", model(4), schedule=schedule, white=True)
-    assert not any(control.resets(t) or control.recovers(t) for t in range(1, 3000))
+    assert not any(one.reset_opacity or one.recovers for one in map(control.actions, range(1, 3000)))
 
 
 @pytest.mark.parametrize(("allowed", "interval", "resets"), [(True, 3000, 5), (False, 3000, 0), (False, 2500, 6)])
@@ -267,5 +268,5 @@ def test_a_part_may_want_no_resets(allowed, interval, resets):
     parts = [SimpleNamespace(needs=Needs(resets=allowed))]
     opt = options(opacity_reset_interval=interval)
     control = begun("adc", model(4), opt, Schedule(30_000), white=True, parts=parts)
-    assert sum(control.resets(t) for t in range(1, 30_000)) == resets
+    assert sum(control.actions(t).reset_opacity for t in range(1, 30_000)) == resets
     assert opt.opacity_reset_interval == interval

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from applications.evaluation.figures import draw_cameras, draw_curves, draw_sizes
 from applications.evaluation.report import _find_cameras
 from splatting.records.error_curve import COLUMNS
-from splatting.records.figures import draw_cameras, draw_curve, draw_curves, draw_sizes
+from splatting.records.figures import draw_curve
 
 NAMES = ("seconds", "test_psnr", "test_ssim", "train_psnr", "train_ssim", "subset")
 

@@ -20,9 +20,9 @@ import export
 import render
 import train
 from applications.export.formats import find_format
+from applications.export.importance import most_needed
 from applications.export.reading import read_any
 from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
-from gaussian_renderer.importance import most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import save_checkpoint

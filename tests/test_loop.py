@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 import train
 from groundwork.host.progress import Bar, in_threads
+from scene.gaussians.density_rules import Actions
 from splatting.log import ProgressBar
 from splatting.loop import standard_observers
 from splatting.objective import LossWatch
@@ -44,9 +45,6 @@ class Recorder(Part):
         self._note("due", step.iteration)
         return step.iteration in self._writes
 
-    def begins(self, step) -> None:
-        self._note("begins", step.iteration)
-
     def measured(self, step, losses) -> None:
         assert losses.total.isfinite() and losses.l1.isfinite()
         self._note("measured" + " due" * step.due, step.iteration)
@@ -72,7 +70,7 @@ def test_every_hook_is_called_once_an_iteration_and_in_order(colmap_scene, tmp_p
     for t in range(1, ITERATIONS + 1):
         # The observer writes in 7; density control changes the Gaussians in 10 and 20.
         due = " due" if t in (7, 10, 20) else ""
-        expected += [("due", t), ("begins", t), ("measured" + due, t), ("stepped", t)]
+        expected += [("due", t), ("measured" + due, t), ("stepped", t)]
     assert told == [*expected, ("ended", 0)]
 
 
@@ -89,7 +87,7 @@ def test_observers_are_told_in_the_order_of_the_list_and_of_the_error(colmap_sce
 
     with pytest.raises(RuntimeError, match="broken"):
         _train(colmap_scene, tmp_path, monkeypatch, observers)
-    hooks = ("due", "begins", "measured", "stepped")
+    hooks = ("due", "measured", "stepped")
     first = [(f"{name} {hook}", 1) for hook in hooks for name in "ab"]
     second = [(f"{name} {hook}", 2) for hook in hooks for name in "ab"][:-1]  # b is not told that 2 has stepped
     assert told == [*first, *second, ("a RuntimeError", 0), ("b RuntimeError", 0)]
@@ -101,12 +99,8 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
     class Other(Strategy):
         name = "adc"
 
-        def begin(self, run, state) -> None:
-            super().begin(run, state)
-            self._gaussians = run.gaussians
-
-        def changes(self, iteration: int) -> bool:
-            return iteration == 3
+        def actions(self, iteration: int) -> Actions:
+            return Actions(changes=iteration == 3)
 
         def after_backward(self, step, package) -> None:
             assert self._gaussians.get_xyz.grad is not None and package["radii"].any()

@@ -12,7 +12,7 @@ from viewer_client import FIELDS, as_bytes, request
 from gaussian_renderer import render
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.network_message import BadMessage, decode, parse
-from splatting.features.remote_viewer import frame_bytes
+from splatting.remote_viewer import frame_bytes
 
 CAMERA = free_view(24, 16, 0.8, (0.1, -0.2, -3.0), (0.9, 0.3, -0.2, math.sqrt(0.06)), "cpu")
 VALID = request(CAMERA)

@@ -62,9 +62,9 @@ MAY = {
     "splatting.records.error_curve.continue_curve": MODEL,
     "applications.evaluation.stages._remove_stop": MODEL,
     "splatting.run.open": MODEL,
-    "splatting.features.resume.opened": MODEL,
-    "splatting.features.resume.ended": MODEL,
-    "splatting.features.resume._continued": MODEL,
+    "splatting.resume.__init__": MODEL,
+    "splatting.resume.ended": MODEL,
+    "splatting.resume._continued": MODEL,
     "splatting.features.robust_mask_residuals.write_masks": MODEL,
     "applications.convert.adding.forget_base": WORK,
     "applications.convert.adding.keep_base": WORK,
@@ -189,7 +189,7 @@ def test_a_record_of_others_leads_to_no_other_folder(tmp_path):
 def test_figures_go_by_no_settings_of_the_current_folder(tmp_path):
     pytest.importorskip("matplotlib")
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\n")
-    code = "from splatting.records.figures import _figure\nfrom matplotlib import rcParams\n"
-    code += "assert rcParams['text.usetex']\n_figure(1, (2, 2), '')\nassert not rcParams['text.usetex']"
+    code = "from splatting.records.figures import make_figure\nfrom matplotlib import rcParams\n"
+    code += "assert rcParams['text.usetex']\nmake_figure(1, (2, 2), '')\nassert not rcParams['text.usetex']"
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True)

@@ -1,6 +1,5 @@
 """Rules of parts (splatting/part.py): nobody names one outside of its files, and each can be deleted."""
 
-import argparse
 import ast
 import re
 import subprocess
@@ -14,8 +13,9 @@ from forks import fork
 from synthetic import make_colmap_scene
 
 from arguments.features import FEATURES, appearances, strategies
-from splatting.part import Appearance, Part, Strategy, fill, overrides
+from splatting.part import Appearance, Part, Strategy
 from splatting.registry import PARTS, states_in
+from splatting.run import overrides
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -122,7 +122,7 @@ def test_parts_import_no_options_which_another_package_may_hide():
 
 
 def test_the_table_of_options_has_parts_in_their_order_and_what_they_are():
-    assert [*FEATURES] == [name for name in NAMES if name in FEATURES]
+    assert [name for name in FEATURES if name in NAMES] == [name for name in NAMES if name in FEATURES]
     assert [*strategies()] == [part.name for part in PARTS if issubclass(part, Strategy)]
     flags = {part.kind: part.flag for part in PARTS if issubclass(part, Appearance)}
     assert {one.name: one.flag for one in appearances()} == flags
@@ -178,7 +178,7 @@ TRAINED = """
 import doctor, export, render, train
 scene, out, strategy = words
 short = ["--strategy", strategy, "--iterations", "20", "--test_iterations", "20", "--eval", "-r", "48"]
-train.main(["-s", scene, "-m", out, *([] if "remote_viewer" in hidden else ["--disable_viewer"]), *short])
+train.main(["-s", scene, "-m", out, "--disable_viewer", *short])
 for command, line in ((render, ["-m", out]), (doctor, ["-m", out]), (export, ["-m", out, "--to", out + "/a.ply"])):
     sys.argv = [command.__name__, *line]
     try:
@@ -220,19 +220,3 @@ def test_hooks_that_are_not_overridden_are_not_called():
 
     parts = [Part(), Counting()]
     assert [hook.__self__ for hook in overrides(parts, "stepped")] == parts[1:] and not overrides(parts, "ended")
-
-
-def test_a_second_provider_of_a_slot_is_refused_with_both_names():
-    class One(Part):
-        name = "one"
-
-    class Other(Part):
-        name = "other"
-
-    run = argparse.Namespace()
-    fill(run, "counts", 1, One())
-    fill(run, "counts", 2, One())
-    assert run.counts == 2
-    with pytest.raises(UserError, match="--other does not work with --one: both set counts"):
-        fill(run, "counts", 3, Other())
-    assert run.counts == 2

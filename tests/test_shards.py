@@ -64,7 +64,7 @@ def _train(gaussians: GaussianModel, density: object, iterations: tuple[int, ...
         points = torch.zeros(len(gaussians), 3)
         points.grad = THRESHOLD * (2 * _random(gaussians, f"seen{iteration}", 3)).round()  # several are the same
         radii = (20 * _random(gaussians, f"radii{iteration}").abs()).int()
-        step = SimpleNamespace(iteration=iteration, background=None)
+        step = SimpleNamespace(iteration=iteration, background=None, density=density.actions(iteration))
         density.after_backward(step, {"viewspace_points": points, "radii": radii})
         if len(gaussians):
             gaussians.step(radii)
@@ -104,9 +104,8 @@ def _emptied(gaussians: GaussianModel) -> None:
 
 def _mcmc(gaussians: GaussianModel, **changes: object) -> None:
     changes = {"mcmc_min_opacity": 0.02, "mcmc_noise": 1e4, "mcmc_growth": 0.2} | changes
-    density = begun("mcmc", gaussians, options(strategy="mcmc", **changes))
-    if "max_num_splats" not in changes:
-        density.started()
+    starts = "max_num_splats" not in changes
+    density = begun("mcmc", gaussians, options(strategy="mcmc", **changes), starts=starts)
     _train(gaussians, density, (501, 600, 700))
     with torch.no_grad():
         gaussians.raw("opacity").copy_(3 * _random(gaussians, "opacity", 1))

@@ -18,6 +18,7 @@ import numpy as np
 from markupsafe import Markup
 
 from applications.evaluation import comparison, tables
+from applications.evaluation.figures import draw_cameras, draw_curves, draw_poses, draw_sizes
 from applications.evaluation.gains import compute_gains
 from applications.evaluation.paper import format_csv, format_tex
 from groundwork.files.image_files import open_image
@@ -25,7 +26,6 @@ from groundwork.files.json_files import write_json
 from groundwork.host.listing import markdown_table
 from groundwork.host.machine import one_line
 from scene.readers.info import from_above, up_of
-from splatting.records.figures import draw_cameras, draw_curves, draw_poses, draw_sizes
 from splatting.records.model_folder import json_or_none
 from splatting.records.renders import GAIN, MASK_PICTURE, ComparedViews
 from utils.system_utils import UserError, atomic_write

@@ -200,4 +200,4 @@ def shorter_ends_there(model: Path, iterations: int) -> bool:
         options = read_stored_options(model)
     except UserError:
         return False
-    return not any(part.follows_length(argparse.Namespace(**options)) for part in PARTS)
+    return not any(part.needs.length and part.asked_by(argparse.Namespace(**options)) for part in PARTS)

@@ -22,7 +22,10 @@ import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 
+from applications.export.cleaning import OPTION as CLEAN_OPTION
+from applications.export.cleaning import check_clean, clean_scene, write_comparison
 from applications.export.formats import ENDINGS, FORMATS, Format, SceneInputs, find_format
+from applications.export.importance import most_needed
 from applications.export.notes import read_notes
 from applications.export.reading import ANY, read_any
 from applications.export.upright import add_upright_options, check_upright, follows_scene, move_upright
@@ -34,7 +37,6 @@ from gaussian_renderer.camera_paths.without_scene import (
     recorded_cameras_file,
     warn_if_moved,
 )
-from gaussian_renderer.importance import most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
 from groundwork.files.json_files import read_model_json
@@ -46,8 +48,6 @@ from scene.splats.reading import READABLE
 from scene.splats.splats import Splats, choose, selected, tidy, used_sh_degree, with_sh_degree
 from scene.splats.spz import WRITTEN
 from scene.with_splats import load_file, model_of, place, splats_of
-from splatting.cleaning import OPTION as CLEAN_OPTION
-from splatting.cleaning import check_clean, clean_scene, write_comparison
 from splatting.registry import PARTS
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device

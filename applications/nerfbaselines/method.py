@@ -27,7 +27,7 @@ from splatting.loop import training_steps
 from splatting.part import Part
 from splatting.records import training_log
 from splatting.registry import PARTS
-from splatting.run import Run
+from splatting.run import Run, make_run
 from splatting.watch import MaskWatch
 from utils.system_utils import UserError, compute_device, saved_ply
 
@@ -41,7 +41,7 @@ _OF_FILES += tuple(part.name for part in PARTS if part.needs.files)
 _FIXED = dict.fromkeys(
     ("advise", "detect_anomaly",
      "start_checkpoint", "source_path", "model_path", "images", "invert_masks", "keep_unseen", "prune_sh",
-     *(name for part in PARTS if part.told_last for name in FEATURES[part.name].by_name))
+     *(name for one in ("resume", "remote_viewer", "viewer") for name in FEATURES[one].by_name))
     , "",
 ) | {"options": "given", "resolution": "1", "mask_meaning": "auto", "disable_viewer": "true",
      "holdout": "every8"}  # fmt: skip
@@ -69,10 +69,9 @@ def words_of(options: Mapping[str, Any]) -> list[str]:
 class _Losses(Part):
     """Lets the losses be read at intervals."""
 
-    reads_model = False
-
     def due(self, at: Iteration) -> bool:
-        return at.last or at.iteration % INTERVAL == 0
+        at.due |= at.last or at.iteration % INTERVAL == 0
+        return False  # nobody reads the model
 
 
 class GaussianSplatting(Method):
@@ -116,7 +115,7 @@ class GaussianSplatting(Method):
             launch.start_checkpoint = str(next(Path(self._checkpoint).glob("chkpnt*.pth")))
         info = scene_of(dataset, StartOptions(model.init_pcd_path, model.init_type))
         with in_place_of_files(info, folder / "scene") as model.source_path:
-            self._run = run = Run(*self._options, launch)
+            self._run = run = make_run(*self._options, launch)
         run.open()
         guards = [run.watch, MaskWatch(run.scene.getTrainCameras()), _Losses()]
         self._steps = training_steps(run, guards)

@@ -25,8 +25,6 @@ from scene.scene import Scene
 from scene.splats.reading import READABLE
 from scene.splats.splats import drawable, selected
 from scene.with_splats import model_of, splats_in
-from splatting.cleaning import OPTION as CLEAN_OPTION
-from splatting.cleaning import check_clean, clean_scene
 from utils.general_utils import safe_state
 from utils.system_utils import UserError
 
@@ -57,7 +55,7 @@ def find_kept(
         return None
     if isinstance(scene, WithoutScene):
         raise UserError(f"--clean needs the photos of {options.source_path}, which is gone; leave it out")
-    return clean_scene(scene, args.clean, pipe, options.white_background)[0].keep
+    return application("export", "cleaning").clean_scene(scene, args.clean, pipe, options.white_background)[0].keep
 
 
 def main() -> None:
@@ -68,8 +66,8 @@ def main() -> None:
     parser.add_argument(
         "--port", type=int, default=VIEWER_PORT, help=f"port of the page, 0: any (default: {VIEWER_PORT})"
     )
-    parser.add_argument("--clean", **CLEAN_OPTION, help="let the tab View show what export.py --clean leaves out "
-        "(default: off; 0.05 without a number)")  # fmt: skip
+    help_text = "let the tab View show what export.py --clean leaves out (default: off; 0.05 without a number)"
+    parser.add_argument("--clean", type=float, nargs="?", const=0.05, metavar="DB", help=help_text)
     parser.add_argument("--quiet", action="store_true", help="print nothing to stdout (default: off)")
     parser.add_argument(
         "file",
@@ -81,7 +79,8 @@ def main() -> None:
     args = parser.parse_args()
     if args.file and args.model_path:
         raise UserError(f"-m {args.model_path} has a model of its own; leave {args.file} or -m out")
-    check_clean(args.clean)
+    if args.clean is not None:
+        application("export", "cleaning").check_clean(args.clean)
     if args.clean and not args.model_path:
         raise UserError("--clean needs training views of a model; give the model's folder with -m")
     before = bool(args.source_path) and not (args.file or args.model_path)

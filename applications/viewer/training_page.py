@@ -11,7 +11,7 @@ from applications.viewer.watchers import MOVING, STILL, Budget, Wish
 from groundwork.host.listing import as_utf8
 from scene.saved_model import read_model
 from splatting.iteration import Iteration
-from splatting.part import Error
+from splatting.part import Error, Part
 from splatting.records.error_curve import common_subset, rows_on
 from splatting.run import Run
 from utils.system_utils import UserError, saved_ply
@@ -20,7 +20,7 @@ _NUMBERS_EVERY = 0.5  # seconds
 _WAIT = 0.2  # seconds until a paused training notices a signal
 
 
-class TrainingPage:
+class TrainingPage(Part):
     """Draws frames for the page between two iterations, and does what its buttons ask for.
 
     While nobody watches it asks one variable in each iteration. The time it takes is not that of training.

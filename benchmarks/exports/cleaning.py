@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from applications.export.cleaning import Cleaning, clean
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args
 from benchmarks.harness.measuring import describe_machine, print_table
 from gaussian_renderer.camera_paths.poses import Poses, focus_point, poses_of
@@ -19,7 +20,6 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
 from scene.splats.splats import Splats
 from scene.with_splats import model_of, splats_of
-from splatting.cleaning import Cleaning, clean
 from utils.system_utils import UserError, compute_device, run_cli
 
 _PLACES = (0.25, 0.6)  # of the way from a camera to the point

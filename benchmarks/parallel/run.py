@@ -5,21 +5,19 @@ from types import SimpleNamespace
 import torch
 
 from benchmarks.parallel.workload import Workload
-from groundwork.host.interrupt import DeferredInterrupt
 from groundwork.ranks.ranks import ranks
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.morton import sort_rows
 from scene.in_view import share_in_view
 from scene.sleeping import Sleeping
 from splatting.commands import train
-from splatting.features.sleep import Sleep
-from splatting.features.spill import Spill, sentences
 from splatting.iteration import ViewOrder
-from splatting.objective import LossWatch, Objective
+from splatting.objective import Objective
 from splatting.records.training_log import Stopwatch
 from splatting.registry import strategy_part
 from splatting.run import Run
 from splatting.schedule import Schedule
+from splatting.spill import make_storage, sentences
 from splatting.watch import DivergenceWatch
 from utils.system_utils import compute_device
 
@@ -37,46 +35,37 @@ class WorkloadRun(Run):
     """
 
     def __init__(self, workload: Workload, steps: int, still: bool, sleep: bool = False, gpu_memory: float = 0) -> None:
-        self.group = ranks()
+        group, device, gaussians = ranks(), compute_device(), GaussianModel(3)
         words = ["-s", ".", "--iterations", str(steps), "--densify_from_iter", "10000", *_STILL * still]
         words += ["--strategy", "adc", *(["--gpu_memory", str(gpu_memory)] if gpu_memory else [])]
-        self.launch, self.dataset, self.opt, self.pipe = train.parse(words)
-        self.first_iteration = 0
-        self.interrupt, self.device = DeferredInterrupt(), compute_device()
-        self.schedule = Schedule(self.opt.iterations)
-        images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
-        self.gaussians = GaussianModel(3)
-        self._fill_slots()
+        launch, dataset, opt, pipe = train.parse(words)
         self._cameras = cameras = workload.cameras()
+        images = SimpleNamespace(ahead=0, keep_on=torch.device("cpu"), planned_bytes=0)
         info = SimpleNamespace(point_cloud=None)
-        self.scene = SimpleNamespace(
+        scene = SimpleNamespace(
             cameras_extent=_EXTENT, images=images, prefetch=lambda _: None, model_path=".", info=info
         )
-        self.scene.getTrainCameras = lambda: cameras
+        scene.getTrainCameras = lambda: cameras
         if gpu_memory:
-            self.parts = [Spill()]
-            self.parts[0].check(self, None)
-            self.gaussians.storage.reserve(-(-workload.gaussians // self.group.size), self.scene)
+            gaussians.storage = make_storage(gaussians, opt, device, absolute=False)
+            gaussians.storage.reserve(-(-workload.gaussians // group.size), scene)
+        made = Schedule(opt.iterations), scene, gaussians, ViewOrder(cameras, opt.seed)
+        super().__init__(dataset, opt, pipe, launch, group, device, None, 0, [], *made)
         self._begin(workload)
-        self.views = ViewOrder(cameras, self.opt.seed)
-        self.background = torch.zeros(3, device=self.device)
-        self.objective, self.losses = Objective(self), LossWatch()
-        self.log, self.rows, self.first_done = SimpleNamespace(seconds_before=0.0), [], None
+        self.objective = Objective(self)
+        self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.watch = DivergenceWatch(self)
         self.strategy = strategy_part("adc")
         self.strategy.begin(self, None)
-        self.parts = [*self.parts, self.strategy]
+        self.parts = [self.strategy]
         if sleep:
-            sort_rows(self.gaussians)
-            self.sleeping = Sleeping(self.gaussians)
-            keeps = Sleep()
-            keeps.begin(self, None)
-            self.parts = [*self.parts, keeps]
+            sort_rows(gaussians)
+            self.sleeping = Sleeping(gaussians)
 
     def _begin(self, workload: Workload) -> None:
         gaussians, here = self.gaussians, self.group
         gaussians.divide(here)
-        keep = torch.device("cpu") if gaussians.storage.limit else self.device
+        keep = torch.device("cpu") if gaussians.storage else self.device
         gaussians.set_rows(workload.rows(here.rank, here.size, self.device, keep))
         gaussians.active_sh_degree, gaussians.spatial_lr_scale = 3, _EXTENT
         gaussians.start_exposures(())
@@ -86,7 +75,7 @@ class WorkloadRun(Run):
     def open(self) -> None:
         """Say what is spilled, and start the clocks; nothing is written."""
         room = self.gaussians.storage
-        if room.host_bytes(len(self.gaussians)):
+        if room and room.host_bytes(len(self.gaussians)):
             room.rebalance(self.gaussians)
             seen = share_in_view(self.gaussians.get_xyz.detach(), self._cameras)
             print("".join(f"{said}\n" for said in sentences(room, len(self.gaussians), seen, True)), end="")

@@ -60,11 +60,9 @@ class Timing(Part):
         self.peak_mib = 0.0  # before the last step
 
     def due(self, at: Iteration) -> bool:
-        return False
-
-    def begins(self, at: Iteration) -> None:
         if at.last:
             self.peak_mib = peak_memory_mib(self._device) or 0.0
+        return False
 
     def stepped(self, at: Iteration) -> None:
         done = at.iteration - self._first

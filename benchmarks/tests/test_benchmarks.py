@@ -84,7 +84,7 @@ def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process
     rows = _rows(capsys.readouterr().out, "city")
     assert [row[1:3] for row in rows] == [["1", "gpu"], ["2", "gpu"]]
     assert rows[0][6] == "1.00" and float(rows[1][6]) > 0
-    monkeypatch.setattr("splatting.features.spill.refuse_without_gpu", lambda device: None)
+    monkeypatch.setattr("splatting.spill.refuse_without_gpu", lambda device: None)
     monkeypatch.setattr(
         sys, "argv", ["steps", "--model", "sleep", "spill", "--learn", "--cap", "0.001", *words.split()]
     )

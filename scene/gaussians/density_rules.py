@@ -45,24 +45,41 @@ def band_rate(cameras: Sequence[Any]) -> float:
 
 
 class Actions(NamedTuple):
-    """Steps of density control that are due in one iteration, in this order."""
+    """Answers of density control for one iteration. What is due happens in this order."""
 
-    observe: bool  # add this view to the statistics
-    densify: bool
-    limit_size: bool  # densification also removes Gaussians that are too wide
-    reset_opacity: bool
+    changes: bool = False  # rows or opacities may change
+    observe: bool = False  # the view is added to the statistics
+    densify: bool = False
+    limit_size: bool = False  # densification also removes Gaussians that are too wide
+    reset_opacity: bool = False
+    recovers: bool = False  # opacities were reset so recently that renders do not resemble photos yet
 
 
-def interval(opt: argparse.Namespace, until: int, stride: float) -> int:
-    """Iterations from one densification to the next: densification_interval of the options, in most runs.
+class Window(NamedTuple):
+    """The densifications of a training: after step `start` of the schedule, before `end`, every `stride` iterations.
 
-    until: the end of the window of densifications, which begins with densify_from_iter, in iterations of the schedule;
-    stride: of these, how many each iteration stands for. Where they are several, there would be too few densifications.
+    The stride is of iterations, as statistics need views.
     """
-    if stride <= 1:
-        return opt.densification_interval
-    steps = (until - opt.densify_from_iter) / stride
-    return min(opt.densification_interval, max(1, int(steps / FEW_DENSIFICATIONS)))
+
+    start: int
+    end: int
+    stride: int
+
+    def interval(self, pace: float) -> int:
+        """Return the iterations from one densification to the next.
+
+        pace: steps of the schedule for each iteration. Where they are several, there would be too few densifications.
+        """
+        if pace <= 1:
+            return self.stride
+        return min(self.stride, max(1, int((self.end - self.start) / pace / FEW_DENSIFICATIONS)))
+
+    def is_due(self, iteration: int, step: int, pace: float) -> bool:
+        """Tell whether an iteration densifies by the window's end and stride.
+
+        step: the iteration's step of the schedule.
+        """
+        return step < self.end and iteration % self.interval(pace) == 0
 
 
 def actions(
@@ -75,21 +92,19 @@ def actions(
     """Actions due in an iteration (paper, section 5.2, in the reference's windows): none from densify_until_iter on.
 
     span, stride: the iterations of the schedule that it stands for, and their mean number there; by default itself.
-    The options' windows and resets are of the schedule; densifications come every `interval` iterations, as their
-    statistics need views. Resets that do not pay are left out.
+    The options' windows and resets are of the schedule. Resets that do not pay are left out.
     """
     before, now = (iteration - 1, iteration) if span is None else (span.start - 1, span.stop - 1)
-    active, resets = now < opt.densify_until_iter, opt.opacity_reset_interval
-    of_white = white_background and before < opt.densify_from_iter <= now
-    kinds = (now // resets > before // resets, False), (of_white, True)
-    return Actions(
-        observe=active,
-        densify=active
-        and now > opt.densify_from_iter
-        and iteration % interval(opt, opt.densify_until_iter, stride) == 0,
-        limit_size=now > resets,
-        reset_opacity=active and any(is_due and reset_pays(now, opt, stride, white) for is_due, white in kinds),
+    start, end, resets = opt.densify_from_iter, opt.densify_until_iter, opt.opacity_reset_interval
+    if now >= end:
+        return Actions(limit_size=now > resets)
+    window = Window(start, end, opt.densification_interval)
+    of_white = white_background and before < start <= now
+    reset = (now // resets > before // resets and reset_pays(now, opt, stride)) or (
+        of_white and reset_pays(now, opt, stride, of_white)
     )
+    densify = now > start and window.is_due(iteration, now, stride)
+    return Actions(densify or reset, True, densify, now > resets, reset)
 
 
 def reset_pays(step: int, opt: argparse.Namespace, stride: float = 1.0, of_white: bool = False) -> bool:

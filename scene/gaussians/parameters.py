@@ -17,7 +17,7 @@ from groundwork.ranks.rows import WHOLE, Divided, Shards
 from scene.gaussians.attributes import Attribute, Rows, attributes
 from scene.gaussians.finite import warn_of_undrawn
 from scene.gaussians.ply import FLAT, column_names, frame_comments, read_ply, row_bytes, write_ply
-from scene.gaussians.spilled import Storage, empty_for, is_spilled, to_host
+from scene.gaussians.spilled import Storage, is_spilled, to_host
 from scene.gaussians.statistics import NAMES, Statistics
 from scene.gaussians.table import GaussianTable
 from utils.general_utils import build_scaling_rotation, inverse_sigmoid, strip_symmetric
@@ -50,7 +50,8 @@ class GaussianParameters:
     are enlarged where they are drawn (scene/readers/tracks.py). Activations are attributes, which
     `setup_functions` sets.
     The tensors become parameters when rows are taken; an empty model has plain ones, as in the reference. shards: where
-    these rows are among those of all ranks, if several have a part of the model each. storage: where rows lie.
+    these rows are among those of all ranks, if several have a part of the model each. storage: where rows
+    lie, None: on the device.
     fixed: tells which of means (N,3) density control leaves, of any size, (N,) bool; None: it may remove all.
     max_radii2D, xyz_gradient_accum, denom: observations since the last densification (Statistics has shapes and units).
     optimizer: any of torch's, with `name` in its groups; None until training is set up. tmp_radii: (N,) pixels of the
@@ -64,7 +65,7 @@ class GaussianParameters:
     world_offset = (0.0, 0.0, 0.0)
     enlargement = 1.0
     shards: Shards = WHOLE
-    storage: Storage = Storage()
+    storage: Storage | None = None
     fixed: Callable[[Tensor], Tensor] | None = None
     optimizer: torch.optim.Optimizer | None = None
     tmp_radii: Tensor | None = None
@@ -283,7 +284,7 @@ class GaussianParameters:
         rows = raw_rows(self)
         rest = rows.pop("f_rest")[:, : (sh_degree + 1) ** 2 - 1]
         rows = {name: values[keep] for name, values in rows.items()}
-        rows["f_rest"] = to_host(rest, keep) if is_spilled(rest) else rest[keep].contiguous()
+        rows["f_rest"] = to_host(rest, keep) if self.storage and is_spilled(rest) else rest[keep].contiguous()
         other = copy.copy(self)
         other.max_sh_degree, other.active_sh_degree = sh_degree, min(sh_degree, self.active_sh_degree)
         other.optimizer = None
@@ -307,7 +308,7 @@ class GaussianParameters:
         params = {}
         for name in self._attributes:
             like = rows[name][:0].to(device)
-            room = empty_for(self, name, like, len(rows[name]))
+            room = self.storage and self.storage.empty_for(name, like, len(rows[name]))
             params[name] = nn.Parameter(rows[name].to(device) if room is None else room.copy_(rows[name].detach()))
         self._take(params)
         self.columns = {}

@@ -5,8 +5,6 @@ one range of addresses, so kernels and copies treat such a tensor like any other
 rasterizer). On the CPU there are none.
 """
 
-from typing import Any
-
 import groundwork.host.extensions  # noqa: F401  isort: skip  (before the extensions)
 import torch
 from diff_gaussian_rasterization.backend import OPERATORS
@@ -16,42 +14,23 @@ from groundwork.ranks.rows import PIECE
 
 
 class Storage:
-    """The slot `model.storage`: all rows stay on the device. A part may divide them between the device and the host.
-
-    limit: bytes of the device that a training may use; 0: all.
-    """
-
-    limit = 0
-
-    def reserve(self, count: int, scene: Any) -> None:
-        """Plan for `count` Gaussians of this process. scene: its photos take memory, too."""
+    """Storage of a model whose rows may lie partly on the host: `model.storage`, which is None if none may."""
 
     def empty_rows(self, like: Tensor, rows: int) -> Tensor | None:
         """Make an uninitialised tensor for `rows` rows of f_rest; None: torch decides its place."""
-        return None
+        raise NotImplementedError
 
-    def host_bytes(self, count: int) -> int:
-        """Bytes of `count` Gaussians that lie on the host instead of the device."""
-        return 0
+    def empty_for(self, name: str | None, like: Tensor, rows: int) -> Tensor | None:
+        """Make an uninitialised tensor for `rows` rows of an attribute; None: torch decides its place.
 
-    def remedy(self, count: int, lacking: float) -> str:
-        """Advice if memory for `count` Gaussians lacks `lacking` bytes: the beginning of a sentence, or nothing."""
-        return ""
+        like: (..., *shape of a row) on the device that computes.
+        """
+        return self.empty_rows(like, rows) if name == "f_rest" else None
 
-
-def empty_for(model: Any, name: str | None, like: Tensor, rows: int) -> Tensor | None:
-    """Make an uninitialised tensor for `rows` rows of a model's attribute; None: torch decides its place.
-
-    like: (..., *shape of a row) on the device that computes. The model's `storage` decides, if it has one.
-    """
-    room = getattr(model, "storage", None)
-    return room.empty_rows(like, rows) if room is not None and name == "f_rest" else None
-
-
-def to_storage(model: Any, name: str | None, values: Tensor) -> Tensor:
-    """Put values of an attribute where the model keeps them: return a copy, or the values if they are there."""
-    room = None if is_spilled(values) else empty_for(model, name, values, len(values))
-    return values if room is None else room.copy_(values)
+    def put(self, name: str | None, values: Tensor) -> Tensor:
+        """Put values of an attribute where they are kept: return a copy, or the values if they are there."""
+        room = None if is_spilled(values) else self.empty_for(name, values, len(values))
+        return values if room is None else room.copy_(values)
 
 
 def empty_rows(like: Tensor, rows: int, near: int) -> Tensor | None:

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from groundwork.host.memory import is_out_of_memory
 from scene.gaussians.attributes import Rows
-from scene.gaussians.spilled import empty_for, empty_spilled_as, to_storage
+from scene.gaussians.spilled import Storage, empty_spilled_as
 from scene.gaussians.statistics import PER_ROW
 
 Group = dict[str, Any]  # a parameter group of a torch optimiser: `params`, options, and maybe `name`
@@ -28,6 +28,7 @@ class GaussianTable:
     def __init__(self, model: Any) -> None:
         optimizer = model.optimizer
         self._model = model
+        self._storage: Storage | None = getattr(model, "storage", None)
         self.optimised: list[Group] = [] if optimizer is None else list(optimizer.param_groups)
         self.states: States = {} if optimizer is None else optimizer.state
         names = {group.get("name") for group in self.optimised}
@@ -41,7 +42,8 @@ class GaussianTable:
         """Keep the rows (n,) int64, ascending, of the parameters that have `count`. Returns these by name."""
 
         def keep(values: Tensor, name: str, _: bool) -> Tensor:
-            return torch.index_select(values, 0, indices, out=empty_for(self._model, name, values, len(indices)))
+            room = self._storage and self._storage.empty_for(name, values, len(indices))
+            return torch.index_select(values, 0, indices, out=room)
 
         return self._map(self.row_groups(count), keep)
 
@@ -64,7 +66,8 @@ class GaussianTable:
         def grow(values: Tensor, name: str, is_state: bool) -> Tensor:
             new = rows[name]
             new = values.new_zeros(len(new), *values.shape[1:]) if is_state else new
-            return torch.cat((values, new.detach()), out=empty_for(self._model, name, values, len(values) + len(new)))
+            room = self._storage and self._storage.empty_for(name, values, len(values) + len(new))
+            return torch.cat((values, new.detach()), out=room)
 
         params = self._map(groups, grow)
         for name, values in self._columns.items():
@@ -73,7 +76,8 @@ class GaussianTable:
 
     def permute(self, order: Tensor) -> None:
         """Put the rows, with the statistics, into an order (N,) int64: row i becomes what row order[i] was."""
-        self.change(lambda values: _permuted(values, order), self.row_groups())
+        spills = self._storage is not None
+        self.change(lambda values: _permuted(values, order, spills), self.row_groups())
 
     def change(self, change: Change, groups: Iterable[Group]) -> None:
         """Change the rows of groups and of the statistics, one tensor at a time."""
@@ -97,10 +101,8 @@ class GaussianTable:
         for group in (*self.optimised, *self.others):
             if group.get("name") == name:
                 shape = group["params"][0].shape
-                zeros = lambda mean, shape=shape: to_storage(  # noqa: E731
-                    self._model, name, torch.zeros_like(value if mean.shape == shape else mean)
-                )
-                params[name] = self._replace(group, to_storage(self._model, name, value), zeros)
+                zeros = lambda mean, shape=shape: torch.zeros_like(value if mean.shape == shape else mean)  # noqa: E731
+                params[name] = self._replace(group, self._put(name, value), zeros)
         return params
 
     @torch.no_grad()
@@ -133,26 +135,29 @@ class GaussianTable:
         params = {}
         for group in groups:
             name, old = group.get("name"), group["params"][0].detach()
-            value = to_storage(self._model, name, change(old, name, False))
+            value = self._put(name, change(old, name, False))
             del old  # whose memory the averages may need
-            changed = lambda mean, name=name: to_storage(self._model, name, change(mean, name, True))  # noqa: E731
-            params[name] = self._replace(group, value, changed, takes=True)
+            params[name] = self._replace(group, value, lambda mean, name=name: change(mean, name, True), takes=True)
         return params
+
+    def _put(self, name: str | None, values: Tensor) -> Tensor:
+        """Put values of an attribute where the model keeps them."""
+        return self._storage.put(name, values) if self._storage else values
 
     def _replace(self, group: Group, value: Tensor, change: Change, takes: bool = False) -> nn.Parameter:
         """Swap a group's parameter, with `takes` in the model, too. `change` maps its averages, the state with rows."""
-        old, param = group["params"][0], nn.Parameter(value.detach())
+        old, param, name = group["params"][0], nn.Parameter(value.detach()), group.get("name")
         dims, rows = old.dim(), len(old)
         state = self.states.pop(old, None)
         group["params"] = [param]
         if takes:
-            self._model._take({group.get("name"): param})
+            self._model._take({name: param})
         del old  # with `takes` nobody has it any more, so the averages find its memory free
         if state is not None:
             self.states[param] = state
             for key, mean in state.items():
                 if torch.is_tensor(mean) and mean.dim() == dims and len(mean) == rows:
-                    state[key] = change(mean)
+                    state[key] = self._put(name, change(mean))
         return param
 
 
@@ -160,10 +165,13 @@ def _with_rows(groups: Iterable[Group], count: int) -> list[Group]:
     return [g for g in groups if len(g["params"]) == 1 and g["params"][0].dim() and len(g["params"][0]) == count]
 
 
-def _permuted(values: Tensor, order: Tensor) -> Tensor:
-    """values[order]; column by column in the memory of `values` itself where there is too little for all of them."""
+def _permuted(values: Tensor, order: Tensor, spills: bool) -> Tensor:
+    """Return values[order]; column by column in the memory of `values` itself where there is too little for all.
+
+    spills: true if the values may be spilled.
+    """
     try:
-        return torch.index_select(values, 0, order, out=empty_spilled_as(values))
+        return torch.index_select(values, 0, order, out=empty_spilled_as(values) if spills else None)
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise

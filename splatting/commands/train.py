@@ -22,7 +22,8 @@ from splatting.events import summary_writer
 from splatting.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
 from splatting.loop import run_training, standard_observers
 from splatting.registry import PARTS, check_together, chosen
-from splatting.run import Run
+from splatting.resume import choose_checkpoint
+from splatting.run import make_run
 from splatting.scores import training_report
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, mkdir_p
@@ -38,10 +39,10 @@ def train(
     launch: the options of arguments/launch.py.
     """
     stops = {option: continues for part in PARTS for option, continues in part.ends_by.items()}
-    if not all([part.prepare(dataset, opt, launch, stops) for part in PARTS]):
+    if not choose_checkpoint(dataset, opt, launch, stops):
         return
     dataset.model_path = dataset.model_path or folder_of(launch.start_checkpoint) or new_folder(dataset.source_path)
-    run = Run(dataset, opt, pipe, launch)
+    run = make_run(dataset, opt, pipe, launch)
     if not run.start:
         print(f"Optimizing {dataset.model_path}")
     else:

@@ -25,6 +25,7 @@ class FusedStep(FasterSteps):
         pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.camera_steps else None
         self.camera_gradient = pose  # of the last step
         self._adam = FusedAdam(run.gaussians, run.strategy.penalty)
+        self.absolute_gradients = run.strategy.takes_absolute(run.opt)
         self._bands = CachedBands()
         self._is_known = False  # whether the model is one that the operator steps
         self._has_parameter_terms = False
@@ -107,13 +108,13 @@ class FusedStep(FasterSteps):
     def advance(self, at: Iteration, drawn: Drawn, gradients: Gradients) -> None:
         """Take the step of the Gaussians, unless they take none, and add the view to the statistics."""
         gaussians, strategy = self._run.gaussians, self._run.strategy
-        adam, steps, observes = self._adam, at.steps, strategy.observes(at.iteration)
+        adam, steps, observes = self._adam, at.steps, at.density.observe
         if not at.steps or at.changes:
-            left_out = strategy.skips_step(at.iteration) if at.steps else gaussians._attributes
+            left_out = strategy.skips_step(at) if at.steps else gaussians._attributes
             steps = len(left_out) < len(gaussians._attributes)
             adam = FusedAdam(gaussians, strategy.penalty, left_out)
         if steps or observes or self.camera_gradient is not None:
-            drawn.step(adam, *gradients, observes, strategy.absolute_gradients, camera=self.camera_gradient)
+            drawn.step(adam, *gradients, observes, self.absolute_gradients, camera=self.camera_gradient)
 
     def follow(self, at: Iteration) -> None:
         """Change rows, where that is due, and take the step of the exposures."""

@@ -125,7 +125,7 @@ class Graphs:
         """
         camera, run = at.camera, self._run
         held = run.gaussians.exposures.applied and run.gaussians.exposures.held
-        phase = run.strategy.observes(at.iteration), run.gaussians.active_sh_degree, held
+        phase = at.density.observe, run.gaussians.active_sh_degree, held
         size = camera.image_height, camera.image_width, camera.FoVx, camera.FoVy
         kind = (*size, camera.lens, str(camera.columns), *at.terms, *phase)
         graph = self._graphs.get(kind)
@@ -178,6 +178,7 @@ class Graphs:
         placeholder = SimpleNamespace(
             camera=any_camera,
             background=self._background,
+            density=at.density,
             terms={},
             captured=True,
             wants_depth=False,
@@ -201,8 +202,7 @@ class Graphs:
             run.gaussians.exposures.optimizer.zero_grad(set_to_none=False)
         drawn, losses, gradients = self._fused.measure(placeholder, now)
         run.gaussians.guard_loss(iteration, losses.total)
-        strategy = run.strategy
-        observed = strategy.observes(iteration), strategy.absolute_gradients
+        observed = placeholder.density.observe, self._fused.absolute_gradients
         drawn.step(self._adam, *gradients, *observed, now, self._fused.camera_gradient)
         return torch.stack([losses.total, losses.l1])
 

@@ -20,11 +20,11 @@ from torch import Tensor
 from groundwork.deterministic.counter_rng import Stream, permutation
 from scene.cameras import Camera
 from scene.gaussians.adc import refuse_empty, remove_useless
-from scene.gaussians.density_rules import band_rate, default_budget, interval
+from scene.gaussians.density_rules import Actions, band_rate, default_budget
 from scene.gaussians.morton import sort_rows
 from splatting.features.budget_rules import error_scores, fade, split_in_two
 from splatting.iteration import Iteration
-from splatting.part import Strategy
+from splatting.part import Rates, Strategy
 from splatting.schedule import longer_steps
 
 SQUARES = 0.005  # 1 - beta2 of Adam in USUAL iterations; the paper has 0.001
@@ -40,7 +40,6 @@ class Budget(Strategy):
     """
 
     name = "budget"
-    removes = True
     fusable = True
     clamps = False
 
@@ -50,26 +49,27 @@ class Budget(Strategy):
 
     def begin(self, run: Any, state: Any) -> None:
         super().begin(run, state)
-        self._gaussians, self._opt, self._cameras = run.gaussians, run.opt, run.scene.getTrainCameras()
-        self.ends = run.opt.densify_until_iter
+        self._cameras = run.scene.getTrainCameras()
         self._scores = partial(error_scores, run.gaussians, run.pipe, run.gaussians.exposures.applied)
         self.max_gaussians = run.opt.max_num_splats or default_budget(self._cameras)
-        self.band_rate = band_rate(self._cameras)
 
-    def rate_factor(self, iteration: int) -> float:
-        """Return a factor that follows the number of iterations, and falls at the end."""
-        return longer_steps(self.schedule.usual_stride(iteration), iteration / self.schedule.length)
+    def rates(self, iteration: int) -> Rates:
+        """Return rates for few and long steps.
 
-    def beta2(self, iteration: int) -> float:
-        """Return a decay that averages over fewer steps in a run of fewer and longer ones, by their number's root."""
-        return 1.0 - min(SQUARES * math.sqrt(self.schedule.usual_stride(iteration)), 1 / LEAST_AVERAGED)
+        A factor follows the number of iterations, and falls at the end. Squared gradients are averaged over fewer
+        steps, by the root of their number.
+        """
+        stride = self.schedule.usual_stride(iteration)
+        factor = longer_steps(stride, iteration / self.schedule.length)
+        return Rates(factor, band_rate(self._cameras), 1.0 - min(SQUARES * math.sqrt(stride), 1 / LEAST_AVERAGED))
 
-    def changes(self, iteration: int) -> bool:
-        in_time = self.schedule.schedule_step(iteration) < self._opt.densify_until_iter
-        return in_time and iteration % self._interval(iteration) == 0
+    def actions(self, iteration: int) -> Actions:
+        """Return what is due: useless Gaussians are removed before the window's start, too."""
+        due = self.window.is_due(iteration, self.schedule.schedule_step(iteration), self.schedule.stride(iteration))
+        return Actions(changes=due, densify=due)
 
     def after_step(self, at: Iteration) -> None:
-        if not self.changes(at.iteration):
+        if not at.density.densify:
             return
         grows = self._grows(at.iteration)
         aim = now = self._gaussians.gaussian_count
@@ -83,12 +83,6 @@ class Budget(Strategy):
             fade(self._gaussians, self._opt.opacity_decay)
         sort_rows(self._gaussians)
 
-    def projected_count(self, count: int, first: int, last: int) -> int:
-        for iteration in filter(self.changes, range(first, min(last, self.ends))):  # the last iteration takes no step
-            if self._grows(iteration):
-                count = min(self._aim(count, iteration), 2 * count)
-        return count
-
     def _aim(self, now: int, iteration: int) -> int:
         """Return the number of Gaussians to have after the densification of an iteration.
 
@@ -101,18 +95,16 @@ class Budget(Strategy):
         return most - round((most - now) * (remaining / (remaining + 1)))
 
     def _grows(self, iteration: int) -> bool:
-        return self.schedule.schedule_step(iteration) > self._opt.densify_from_iter
+        return self.schedule.schedule_step(iteration) > self.window.start
 
     def _remaining(self, iteration: int) -> int:
         """Return the number of densifications after that of this iteration, at the iteration's stride."""
-        opt, stride = self._opt, self.schedule.stride(iteration)
-        ahead = (opt.densify_until_iter - self.schedule.schedule_step(iteration)) / (self._interval(iteration) * stride)
+        stride = self.schedule.stride(iteration)
+        left = self.window.end - self.schedule.schedule_step(iteration)
+        ahead = left / (self.window.interval(stride) * stride)
         if stride != 1:
             ahead -= 0.5  # the stride changes, so one that just comes in time may not come
         return max(math.ceil(ahead) - 1, 0)
-
-    def _interval(self, iteration: int) -> int:
-        return interval(self._opt, self._opt.densify_until_iter, self.schedule.stride(iteration))
 
     def _chosen(self, at: Iteration, count: int) -> Tensor:
         """Return the indices of this process's Gaussians to split, ascending; `count` at most over all processes."""
@@ -123,6 +115,6 @@ class Budget(Strategy):
     def _scored_views(self, iteration: int) -> list[Camera]:
         order = permutation(self._opt.seed, Stream.SCORED_VIEWS, iteration, len(self._cameras))
         count = SCORED_VIEWS
-        if self.schedule.stride(iteration) > 1:  # few iterations, of which scores shall not take the time
-            count = min(count, max(self._interval(iteration) // ITERATIONS_A_SCORE, 1))
+        if (stride := self.schedule.stride(iteration)) > 1:  # few iterations, of which scores shall not take the time
+            count = min(count, max(self.window.interval(stride) // ITERATIONS_A_SCORE, 1))
         return [self._cameras[index] for index in order[:count]]

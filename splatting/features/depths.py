@@ -22,11 +22,7 @@ class Depths(Part):
     """Finds the depth maps of the training photos, and adds their loss for views whose map is reliable."""
 
     name = "depths"
-    needs = Needs(depth=True, files=True)
-
-    @classmethod
-    def follows_length(cls, given: argparse.Namespace) -> bool:
-        return cls.wanted(given)
+    needs = Needs(depth=True, files=True, length=True)
 
     def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         if not fresh or find_reader_replacement(kind_of(args.source_path)):  # which finds the maps itself

@@ -10,7 +10,7 @@ from scene.dataset_readers import find_reader_replacement
 from scene.readers.info import CameraInfo, SceneInfo, names_of_photos, normalization
 from scene.readers.scene_folder import kind_of
 from scene.scene import Scene, load_exposures, save_exposures
-from splatting.part import Appearance
+from splatting.part import Appearance, Needs
 from utils.image_utils import half
 
 
@@ -24,6 +24,7 @@ class Exposure(Appearance):
     name = "exposure"
     kind = "affine"
     flag = "train_test_exp"
+    needs = Needs(length=True)  # for its learning rate
 
     def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         by_other_code = find_reader_replacement(kind_of(args.source_path))  # which gets the option as an argument

@@ -13,12 +13,12 @@ from collections.abc import Collection
 from typing import Any
 
 from scene.gaussians.adc import refuse_empty, remove_useless
-from scene.gaussians.density_rules import FEW_PHOTOS, band_rate, default_budget, interval
+from scene.gaussians.density_rules import FEW_PHOTOS, band_rate, default_budget
 from scene.gaussians.morton import sort_rows
 from scene.gaussians.penalty import Penalty
 from splatting.features.mcmc_rules import add_noise, grow, is_alive, relocate, start_as
 from splatting.iteration import Iteration
-from splatting.part import Strategy
+from splatting.part import Rates, Strategy
 
 MOST_GAUSSIANS = 1_000_000  # where --max_num_splats is 0
 INIT_SCALES = (0.1, 1.0)  # of the paper's long trainings, and of those by the clock, which are too short for it
@@ -35,9 +35,7 @@ class Mcmc(Strategy):
     until = "mcmc_until_iter", 5 / 6
     fusable = True
     clamps = False
-    default_is_limit = True
     queues = True
-    seen_only = True
 
     @classmethod
     def best_in(cls, seconds: float, run: Any) -> bool:
@@ -47,43 +45,26 @@ class Mcmc(Strategy):
 
     def begin(self, run: Any, state: Any) -> None:
         super().begin(run, state)
-        self._gaussians, opt = run.gaussians, run.opt
-        self._opt, self.ends = opt, opt.mcmc_until_iter
-        paced = run.schedule.paced
-        cameras = run.scene.getTrainCameras()
-        self.band_rate = band_rate(cameras)
-        default = default_budget(cameras) if paced else MOST_GAUSSIANS
-        self.max_gaussians = opt.max_num_splats or default
+        opt, paced, cameras = run.opt, run.schedule.paced, run.scene.getTrainCameras()
+        self._rates = Rates(bands=band_rate(cameras))
+        self.max_gaussians = opt.max_num_splats or (default_budget(cameras) if paced else MOST_GAUSSIANS)
+        run.gaussians.step_sparsely()
+        if run.starts_from_points:  # then more opaque and smaller than of adaptive density control, as released
+            scale = opt.mcmc_init_scale or INIT_SCALES[paced]
+            start_as(run.gaussians, opt.mcmc_init_opacity, scale)
         # Penalties need time; with little of it they only darken (fox_tiny, 1,243 iterations: -1.7 dB), except where
         # they clear away random points (nerf_lego200_tiny, 346 iterations: +17 dB).
         if not paced or self.best_in(run.schedule.seconds, run) or run.scene.info.ply_path is None:
             # Of scales as they are drawn, so that it does not depend on the unit.
             self.penalty = Penalty(opt.mcmc_opacity_reg, opt.mcmc_scale_reg * run.gaussians.enlargement)
 
-    def too_slow(self) -> str:
-        return f"--mcmc_growth {self._opt.mcmc_growth:g} adds too few each time; raise it"
+    def rates(self, iteration: int) -> Rates:
+        return self._rates
 
-    def started(self) -> None:
-        """Make Gaussians more opaque and smaller than adaptive density control does, as in the authors' release."""
-        scale = self._opt.mcmc_init_scale or INIT_SCALES[self.schedule.paced]
-        start_as(self._gaussians, self._opt.mcmc_init_opacity, scale)
-
-    def changes(self, iteration: int) -> bool:
-        opt = self._opt
-        within = opt.densify_from_iter < self.schedule.schedule_step(iteration) < opt.mcmc_until_iter
-        stride = self.schedule.stride(iteration)
-        return within and iteration % interval(opt, opt.mcmc_until_iter, stride) == 0
-
-    def projected_count(self, count: int, first: int, last: int) -> int:
-        # The last iteration is saved before its change.
-        for iteration in filter(self.changes, range(first, min(last, self.ends))):
-            count = max(count, self._grown(count, iteration))
-        return count
-
-    def skips_step(self, iteration: int) -> Collection[str]:
+    def skips_step(self, at: Iteration) -> Collection[str]:
         """Return all attributes, unless there is nothing to change; then the Gaussians take their step."""
-        gaussians, least = self._gaussians, self._opt.mcmc_min_opacity
-        if not self.changes(iteration):
+        gaussians, least, iteration = self._gaussians, self._opt.mcmc_min_opacity, at.iteration
+        if not at.density.densify:
             return ()
         count = gaussians.gaussian_count
         moves = 0 < self._limit(iteration, count, 0) < count or self._grown(count, iteration) > count
@@ -91,13 +72,13 @@ class Mcmc(Strategy):
         return gaussians._attributes if moves else ()
 
     def change_rows(self, at: Iteration) -> None:
-        if self.changes(at.iteration):
+        if at.density.densify:
             self._relocate(at.iteration)
             self._grow(at.iteration)
 
     def after_step(self, at: Iteration) -> None:
         """Add the noise of the random walk (the paper's update by Langevin dynamics)."""
-        if self.changes(at.iteration):
+        if at.density.densify:
             sort_rows(self._gaussians)
         factor = self._gaussians.enlargement**2  # as covariances have the square of the unit
         rate = self._gaussians.position_learning_rate * self._opt.mcmc_noise * factor

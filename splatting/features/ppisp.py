@@ -21,7 +21,7 @@ from scene.readers.tracks import Track
 from scene.scene import Scene
 from splatting.features.ppisp_appearance import UNTRAINED, PhotoAppearance, appearance_of, read_appearance
 from splatting.iteration import Iteration, Term
-from splatting.part import Appearance, Needs, Scored, fill
+from splatting.part import Appearance, Needs, Scored
 from splatting.records.renders import FITTED
 from utils.image_utils import as_float, half
 from utils.system_utils import UserError
@@ -36,7 +36,7 @@ class Ppisp(Appearance):
     """
 
     name = kind = "ppisp"
-    needs = Needs(captured=True, resets=False)
+    needs = Needs(captured=True, resets=False, length=True)  # length: for its learning rate
 
     def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
         names = names_of_photos(scene.info)
@@ -51,7 +51,7 @@ class Ppisp(Appearance):
         if len(views) < 2:
             raise UserError("--appearance ppisp needs at least two training photos; leave it out")
         self.photos = appearance_of(views)
-        fill(run.gaussians, "exposures", self.photos, self)
+        run.gaussians.exposures = self.photos
         if run.start:
             self.photos.training_setup(run.opt)
             if state is None:
@@ -69,8 +69,7 @@ class Ppisp(Appearance):
         """Read the trained numbers, unless the photos are of another scene, or the model was trained without them."""
         own = not getattr(args, "other_scene", "") and _RECORDED in read_model_json(args.model_path)
         views = scene.info.train_cameras
-        photos = read_appearance(args.model_path, views) if own else PhotoAppearance()
-        fill(scene.gaussians, "exposures", photos, self)
+        scene.gaussians.exposures = read_appearance(args.model_path, views) if own else PhotoAppearance()
 
     def scored(self, scene: Scene, pipe: argparse.Namespace, background: Any) -> dict[str, Scored]:
         photos = getattr(scene.gaussians, "exposures", None)  # a model of other code may have none

@@ -17,7 +17,7 @@ from scene.readers.info import CameraInfo, SceneInfo
 from scene.readers.tracks import Track
 from scene.scene import Scene
 from splatting.features.refine_poses_steps import PoseRefinement
-from splatting.part import Needs, Part, Scored, fill
+from splatting.part import Needs, Part, Scored
 from splatting.records.renders import GIVEN_POSES
 from utils.system_utils import UserError
 
@@ -34,7 +34,7 @@ class RefinePoses(Part):
     against = {"projection=ray": "which has no gradients of poses; leave one of them out"}
 
     @classmethod
-    def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
+    def joins_by_state(cls, given: argparse.Namespace, iteration: int) -> bool:
         raise UserError(f"{given.start_checkpoint} was trained with --{cls.name}; give that option")
 
     def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
@@ -45,11 +45,7 @@ class RefinePoses(Part):
         self.poses = PoseRefinement(run.scene, run.dataset.source_path, run.opt.iterations)
         if run.start:
             self.poses.restore(state)
-        fill(run, "camera_steps", self.poses, self)
-
-    def ready(self, run: Any) -> None:
-        """Move the cameras to their trained poses, now that other parts have measured where the cameras were."""
-        self.poses.place()
+        run.camera_steps = self.poses
 
     def records(self) -> dict[str, float]:
         return self.poses.corrections()

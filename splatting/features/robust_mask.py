@@ -20,7 +20,7 @@ from splatting.features.robust_mask_residuals import (
     write_masks,
 )
 from splatting.iteration import Iteration
-from splatting.part import Error, Needs, Part, fill
+from splatting.part import Error, Needs, Part
 
 
 class RobustMask(Part):
@@ -37,11 +37,11 @@ class RobustMask(Part):
         self.residuals = Residuals(run.scene.getTrainCameras(), run.opt.robust_mask, run.device)
         if state is not None:
             self.residuals.restore(state)
-        fill(run, "pixel_filter", self, self)
+        run.pixel_filter = self
 
     def mask(self, at: Iteration, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor | None:
         """Return the pixels that count in a step, within a mask. Residuals teach nothing after opacities were reset."""
-        learns = not self._run.strategy.recovers(at.iteration)
+        learns = not at.density.recovers
         return self.residuals.mask(at.camera, image, target, mask, learns)
 
     def counted(self, camera: Camera) -> Tensor | None:

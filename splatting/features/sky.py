@@ -11,21 +11,24 @@ from scene.readers.tracks import Track
 from scene.scene import Scene
 from splatting.features.sky_shell import FEWEST, Shell, find_sky, resumed_shell, said_of_sky, with_shell
 from splatting.iteration import Iteration, Term
-from splatting.part import Needs, Part, fill
+from splatting.part import Needs, Part
 
 
 class Sky(Part):
     """Adds the sky's Gaussians at the start, holds them on their sphere, and keeps the space before them empty."""
 
     name = "sky"
-    by_state = True
     needs = Needs(depth=True, ranks=False)
     against = {"strategy=mcmc": "which relocates large Gaussians; use adc or budget"}
     shell = None
 
     @classmethod
-    def wanted(cls, given: argparse.Namespace) -> bool:
-        return getattr(given, "sky", "off") != "off"
+    def asked_by(cls, given: argparse.Namespace) -> str:
+        return "--sky" if getattr(given, "sky", "off") != "off" else ""
+
+    @classmethod
+    def joins_by_state(cls, given: argparse.Namespace, iteration: int) -> bool:
+        return True
 
     def begin(self, run: Any, state: Any) -> None:
         self._run = run
@@ -37,7 +40,7 @@ class Sky(Part):
             self.shell = with_shell(run.scene, run.gaussians)
         self.active = self.shell is not None
         if self.active:
-            fill(run.gaussians, "fixed", self.shell.rows, self)
+            run.gaussians.fixed = self.shell.rows
 
     def terms(self, at: Iteration) -> dict[str, Term]:
         points = self.shell.at(at.camera, self._run.scene)

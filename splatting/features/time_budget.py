@@ -1,6 +1,7 @@
 """Trainings that end after given seconds (--time_budget), or take as many iterations as another run (--schedule)."""
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import torch
 
 from groundwork.files.json_files import SCHEDULE
 from groundwork.host.memory import free_memory
+from groundwork.ranks.ranks import ranks
 from scene.gaussians.density_rules import band_rate
 from scene.images.store import GPU_SHARE, ImageStore
 from scene.scene import Scene
@@ -15,7 +17,8 @@ from scene.view import View
 from splatting.features.time_budget_file import schedule_of, table_of, write_schedule
 from splatting.features.time_budget_schedule import AN_ITERATION, SHORT, DecidedSchedule
 from splatting.iteration import Iteration
-from splatting.part import Part, fill
+from splatting.part import Part
+from splatting.schedule import Schedule
 
 LEAST = 32  # pixels of the shorter side of a view; a picture is not made smaller than that
 
@@ -31,55 +34,42 @@ class TimeBudget(Part):
     ends_by = {"time_budget": True, "schedule": False}
 
     @classmethod
-    def wanted(cls, given: argparse.Namespace) -> bool:
-        return bool(getattr(given, "time_budget", 0) or getattr(given, "schedule", ""))
+    def asked_by(cls, given: argparse.Namespace) -> str:
+        return next((f"--{name}" for name in cls.ends_by if getattr(given, name, None)), "")
 
     @classmethod
-    def dropped(cls, given: argparse.Namespace, iteration: int) -> str | None:
-        return (
-            f"{given.start_checkpoint} was trained with --time_budget or --schedule; this run has neither and "
-            f"continues at iteration {iteration} of --iterations {given.iterations}"
+    def joins_by_state(cls, given: argparse.Namespace, iteration: int) -> bool:
+        print(
+            f"warning: {given.start_checkpoint} was trained with --time_budget or --schedule; this run has neither and "
+            f"continues at iteration {iteration} of --iterations {given.iterations}",
+            file=sys.stderr,
         )
+        return False
 
-    def check(self, run: Any, state: Any) -> None:
-        self._run = run
-        schedule = schedule_of(run.opt, run.start, run.first_iteration, run.group.broadcast_object, state)
-        fill(run, "schedule", schedule, self)
-        self._end_in_time(run)
-
-    @staticmethod
-    def _end_in_time(run: Any) -> None:
-        """Set the end of densification to its default, 1/2 or 5/6 of the schedule, where it is at the schedule's end.
-
-        A run by the clock has few iterations, and needs the last ones to train the Gaussians that it has.
-        """
-        for name, part in {strategy.until for strategy in run.strategies}:
-            if getattr(run.opt, name) >= run.opt.iterations:
-                setattr(run.opt, name, int(part * run.opt.iterations))
+    def make_schedule(
+        self, opt: argparse.Namespace, checkpoint: str | None, first_iteration: int, state: Any
+    ) -> Schedule:
+        self._schedule = schedule_of(opt, checkpoint, first_iteration, ranks().broadcast_object, state)
+        return self._schedule
 
     def begin(self, run: Any, state: Any) -> None:
-        run.schedule.random = run.scene.info.has_random_points
-        run.schedule.short = SHORT[run.device.type]
-        cameras = run.scene.getTrainCameras()
-        run.schedule.megapixels = run.scene.training_pixels()[0] / len(cameras) / 1e6
+        schedule, cameras = self._schedule, run.scene.getTrainCameras()
+        schedule.random = run.scene.info.has_random_points
+        schedule.short = SHORT[run.device.type]
+        schedule.megapixels = run.scene.training_pixels()[0] / len(cameras) / 1e6
         if run.device.type == "cuda":
-            run.schedule.an_iteration = AN_ITERATION * max(band_rate(cameras), 1.0)
-        fill(run, "sizes", Sizes(run.schedule, run.scene.images), self)
-
-    def changes(self, iteration: int) -> bool:
-        before, now = map(self._run.schedule.schedule_step, (iteration - 1, iteration))
-        return self._run.sizes.factor_at(before) != self._run.sizes.factor_at(now)
+            schedule.an_iteration = AN_ITERATION * max(band_rate(cameras), 1.0)
+        run.sizes = Sizes(schedule, run.scene.images)
 
     def measured(self, at: Iteration, losses: object) -> None:
         self._iteration = at.iteration
 
     def state(self) -> dict[str, Any] | None:
-        schedule = self._run.schedule
-        return table_of(schedule.decided) if schedule.blocks else None
+        return table_of(self._schedule.decided) if self._schedule.blocks else None
 
     def save(self, scene: Scene) -> None:
         if self._iteration:
-            write_schedule(Path(scene.model_path) / SCHEDULE, self._run.schedule.up_to(self._iteration))
+            write_schedule(Path(scene.model_path) / SCHEDULE, self._schedule.up_to(self._iteration))
 
 
 class Sizes:

@@ -162,8 +162,8 @@ class DecidedSchedule(Schedule):
                 file=sys.stderr,
             )
 
-    def best_strategy(self, run: Any) -> str:
-        return self.strategy or super().best_strategy(run)
+    def best_strategy(self, run: Any, strategies: Sequence[Any]) -> str:
+        return self.strategy or super().best_strategy(run, strategies)
 
     def nothing_left(self, checkpoint: str, iteration: int) -> str:
         return (
@@ -229,12 +229,12 @@ class TimeBudget(DecidedSchedule):
     def possible_levels(self) -> Levels:
         return self.levels or (PYRAMID if self._open else ())
 
-    def best_strategy(self, run: Any) -> str:
+    def best_strategy(self, run: Any, strategies: Sequence[Any]) -> str:
         """Return the strategy that is best in the seconds, among those that the run's parts work with."""
         against = {conflict for part in run.parts for conflict in part.against}  # such as a sky that was found
-        fit = [one for one in run.strategies if f"strategy={one.name}" not in against]
+        fit = [one for one in strategies if f"strategy={one.name}" not in against]
         best = (one.name for one in fit if one.best_in(self.seconds, run))
-        strategy = next(best, super().best_strategy(run))
+        strategy = next(best, super().best_strategy(run, strategies))
         print(f"--time_budget chose --strategy {strategy}; give --strategy to use another one")
         return strategy
 

@@ -23,7 +23,6 @@ from scene.gaussians.adc import remove_useless
 from scene.gaussians.density_rules import band_rate, default_budget
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
-from splatting.checks import another_number
 from splatting.features.budget import Budget
 from splatting.features.budget_rules import error_scores, fade, split_in_two
 from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule
@@ -152,7 +151,8 @@ def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing(
     window = {"densification_interval": 10, "densify_from_iter": -1700, "densify_until_iter": 1000}
     control = _control(DecidedSchedule(Decided(2000, blocks, None, 9.0)), **window, max_num_splats=1000)
     # At the pace of the 80th, the 90th comes just in time.
-    assert max(filter(control.changes, range(1, 160))) == 80 and control.projected_count(100, 1, 160) == 1000
+    due = [iteration for iteration in range(1, 160) if control.actions(iteration).densify]
+    assert max(due) == 80 and control._aim(900, 80) == 1000
 
 
 def test_a_split_leaves_other_rows_alone_and_restarts_averages():
@@ -226,7 +226,7 @@ def counts(monkeypatch) -> list[tuple[int, int]]:
 
     def note(control, step) -> None:
         after_step(control, step)
-        if control.changes(step.iteration):
+        if step.density.densify:
             found.append((step.iteration, len(control._gaussians)))
 
     monkeypatch.setattr(Budget, "after_step", note)
@@ -274,51 +274,13 @@ def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
     assert (aim(123_456, 10.0), aim(20_000, 10.0)) == (25 * 3000, 20_000)  # a given number has the same bound
 
 
-# What is out of reach
-
-
-WINDOW = {"densify_from_iter": 10, "densification_interval": 20, "densify_until_iter": 130}
-LATE = {"densify_from_iter": 160, "densification_interval": 20, "densify_until_iter": 130}
-MCMC = WINDOW | {"mcmc_growth": 0.5, "mcmc_until_iter": 100}
-FARTHER = {"densify_until_iter": 300}
-REACH = [
-    ("budget", 2000, WINDOW | {"densify_until_iter": 100}, 1, None),
-    ("budget", 2000, WINDOW | FARTHER, 1, "is not before the end; give --schedule 160 in place of --iterations 160"),
-    ("budget", 200, LATE, 1, "more than --max_num_splats 200; only faint ones are removed, as --densify_from_iter 160"),
-    ("budget", 200, LATE, 1, "160 is not before the end; give --densify_from_iter 8 --densify_until_iter 80"),
-    ("budget", 2000, LATE | FARTHER, 1, "160 is not before the end; give --schedule 160 in place"),
-    ("budget", 500, LATE, 81, "give --densify_from_iter 84 --densify_until_iter 120"),
-    # 300 Gaussians double in 20, 40, 60 and 80, but not in 100.
-    ("budget", 10_000, WINDOW | {"densify_until_iter": 100}, 1, "will reach 4,800 Gaussians, not 10,000, as they at"),
-    ("mcmc", 200, WINDOW, 1, "it removes none; --strategy budget does"),
-    ("mcmc", 1518, MCMC, 1, None),
-    ("mcmc", 1519, MCMC, 1, "mcmc will reach 1,518 Gaussians, not 1,519, as --mcmc_growth 0.5 adds too few each time"),
-    # 300 grow in 20 to 140; what they become in 160, the last iteration, is not saved.
-    ("mcmc", 9999, MCMC | {"mcmc_until_iter": 25_000}, 1, "will reach 5,122 Gaussians"),
-    ("mcmc", 0, MCMC, 1, None),
-    ("mcmc", 0, MCMC | {"densify_from_iter": 120}, 1, "120 is not before --mcmc_until_iter 100, so no Gaussians are"),
-    ("adc", 301, WINDOW, 1, None),
-    ("adc", 0, WINDOW | {"densify_from_iter": 130}, 1, "not before --densify_until_iter 130, so no Gaussians are"),
-    ("adc", 0, WINDOW | {"densify_until_iter": 0}, 81, None),  # as one asks for who wants none
-    ("adc", 100, WINDOW, 1, "training starts with 300 Gaussians, more than --max_num_splats 100; adc adds none"),
-]
-
-
-@pytest.mark.parametrize(("strategy", "number", "changes", "first", "said"), REACH)
-def test_a_number_out_of_reach_is_told(strategy, number, changes, first, said):
-    """The training starts with 300 Gaussians, and takes 160 iterations."""
-    control = _control(Schedule(160), strategy=strategy, max_num_splats=number, **changes)
-    told = another_number(control, control._opt, 300, first)
-    assert told is None if said is None else said in str(told)
-
-
 @pytest.mark.parametrize(("iterations", "beta2"), [(30_000, 0.995), (7_500, 0.99), (300, 0.95), (10, 1 - 1 / 16)])
 def test_fewer_iterations_average_squared_gradients_over_fewer(iterations, beta2):
     block = Block(iterations, 0.0, 1 / iterations, 0.0)
     for schedule in (Schedule(iterations), DecidedSchedule(Decided(30_000, [block], iterations, 0.0))):
-        assert begun("budget", schedule=schedule).beta2(iterations) == pytest.approx(beta2)
+        assert begun("budget", schedule=schedule).rates(iterations).beta2 == pytest.approx(beta2)
 
 
 def test_bands_learn_slowly_from_few_photos():
     assert [band_rate([None] * count) for count in (10, 50, 75, 100, 1000)] == [0.2, 1.0, 1.5, 2.0, 2.0]
-    assert begun("budget").band_rate == begun("mcmc").band_rate < 1
+    assert begun("budget", schedule=Schedule(9)).rates(1).bands == begun("mcmc").rates(1).bands < 1

@@ -10,8 +10,8 @@ from synthetic import make_colmap_scene
 from trainings import before_steps, train_on
 
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
-from splatting.features.resume_photos import NewFirst, _until, restored
 from splatting.iteration import ViewOrder
+from splatting.resume_photos import NewFirst, _until, restored
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1, "--densify_until_iter", 0)

@@ -25,7 +25,6 @@ from arguments.launch import launch_options
 from gaussian_renderer import network_gui, network_transfer, render
 from gaussian_renderer.free_view import free_view
 from scene.cameras import MiniCam
-from splatting.features.remote_viewer import RemoteViewer
 from splatting.part import Part
 
 ITERATIONS = 60
@@ -77,11 +76,12 @@ class Watched(Part):
         assert self._connected.wait(LIMIT)
         self._run_training(run, [*observers, self])
 
-    def begins(self, step: object) -> None:
+    def due(self, step: object) -> bool:
         self.iteration = step.iteration
         if step.iteration in self.stops:
             assert self._go.wait(LIMIT)
             self._go.clear()
+        return False
 
     def reaches(self, iteration: int) -> None:
         wait_for(lambda: self.iteration == iteration)
@@ -277,10 +277,10 @@ def test_an_address_that_cannot_be_had_is_one_warning(address, capfd):
 def test_a_second_training_says_nothing_of_a_port_that_nobody_chose(colmap_scene, tmp_path, monkeypatch, capfd):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        ip, given, switch = FEATURES[RemoteViewer.name].launch
+        ip, given, switch = FEATURES["remote_viewer"].launch
         for default, warnings in ((port, 0), (1, 1)):
             options = Options(launch=(ip, replace(given, default=default), switch))
-            monkeypatch.setitem(FEATURES, RemoteViewer.name, options)
+            monkeypatch.setitem(FEATURES, "remote_viewer", options)
             train_on(colmap_scene, tmp_path / f"{warnings}", "--iterations", 1, "--port", port, "-r", 48)
             assert capfd.readouterr().err.count("cannot listen at") == warnings
 

@@ -11,9 +11,9 @@ from trainings import train_on
 from arguments.launch import launch_options
 from groundwork.files.json_files import read_model_json
 from scene.gaussians.checkpoint import load_checkpoint
-from splatting.features import resume
-from splatting.features.resume import finished
+from splatting import resume
 from splatting.folder import REPLACED, new_folder
+from splatting.resume import finished
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1)

@@ -30,13 +30,9 @@ from groundwork.ranks.ranks import ranks
 from scene import sleeping
 from scene.gaussians import spilled
 from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
-from splatting import resources, run
-from splatting.features import spill as spill_part
-from splatting.features import spill_memory as gpu_memory
-from splatting.features.spill import Spill, sentences
-from splatting.features.spill_memory import GpuMemory, resident_rows, spillable_bytes
+from splatting import resources, run, spill
 from splatting.resources import training_bytes
-from utils.system_utils import UserError
+from splatting.spill import GpuMemory, make_storage, resident_rows, sentences, spillable_bytes
 
 SPILL = ("--gpu_memory", 1)
 ON_A_GPU = pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
@@ -62,8 +58,8 @@ SCENE = SimpleNamespace(images=None, getTrainCameras=lambda: [VIEW])
 def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> GpuMemory:
     """Return the memory of a GPU, which need not exist, with room for 50 Gaussians reserved."""
     monkeypatch.setattr(GpuMemory, "_limit_torch", lambda self, each: None)
-    monkeypatch.setattr(gpu_memory, "photo_bytes", lambda images, device: photos)
-    monkeypatch.setattr(gpu_memory, "free_memory", lambda device: 2**30)
+    monkeypatch.setattr(spill, "photo_bytes", lambda images, device: photos)
+    monkeypatch.setattr(spill, "free_memory", lambda device: 2**30)
     monkeypatch.setattr(torch.cuda, "memory_allocated", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**31, 2**32))
@@ -82,15 +78,13 @@ def test_the_share_follows_the_number_of_gaussians(monkeypatch):
     assert shares[0] == 1 and shares[-1] == 0 and shares == sorted(shares, reverse=True)
     count = 1_200_000
     near = memory.resident_rows(count)
-    fixed = pixels * resources.PER_PIXEL + 2**27 + gpu_memory._LEAST_SPARE
-    others = count * (12 * 14 + resources.PER_GAUSSIAN + gpu_memory._WHOLE_STEP) + fixed
+    fixed = pixels * resources.PER_PIXEL + 2**27 + spill._LEAST_SPARE
+    others = count * (12 * 14 + resources.PER_GAUSSIAN + spill._WHOLE_STEP) + fixed
     assert abs(near - resident_rows(2**30, count, others, count * 540)) <= 1 and 0 < near < count
     # Where the copy that a change needs does not fit, all rows may stay, but as spilled ones.
     whole = next(count for count in range(10**5, 10**7, 10**4) if memory._spills(count))
     assert memory.resident_rows(whole) == whole
-    fit = [
-        training_bytes(gaussians, n, 0) + n * gpu_memory._WHOLE_STEP + fixed <= 2**30 for n in (whole, whole - 10**4)
-    ]
+    fit = [training_bytes(gaussians, n, 0) + n * spill._WHOLE_STEP + fixed <= 2**30 for n in (whole, whole - 10**4)]
     assert fit == [False, True]
     assert memory.host_bytes(count) == 540 * (count - near)
     assert _memory(monkeypatch, 0).resident_rows(10**9) == 10**9
@@ -103,12 +97,12 @@ def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     assert memory.limit == 0 == memory.host_bytes(500_000)
     assert memory.remedy(1000, 540_000) == "set --gpu_memory, or " and memory.remedy(1000, 540_001) == ""
     memory.reserve(1_300_000, SCENE)
-    assert memory.limit == int(gpu_memory._USABLE * 2**30)
+    assert memory.limit == int(spill._USABLE * 2**30)
     said = sentences(memory, 1_300_000, 0.02, True)
     assert len(said) == 1 and "GiB of 1,300,000 Gaussians are kept in the host's memory" in said[0]
     assert said[0].endswith("the saved files are the same")
     memory.reserve(10**9, SCENE)  # no other limit
-    assert memory.limit == int(gpu_memory._USABLE * 2**30) and memory.remedy(1000, 1) == ""
+    assert memory.limit == int(spill._USABLE * 2**30) and memory.remedy(1000, 1) == ""
     there = GpuMemory(0.0, model(50), False, torch.device("cpu"))
     there.reserve(10**12, SCENE)
     assert there.limit == 0 and there.remedy(1000, 1) == ""
@@ -122,8 +116,8 @@ def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (total, total))
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
     monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: 1.0)
-    monkeypatch.setattr(gpu_memory, "_before", [])
-    monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
+    monkeypatch.setattr(spill, "_before", [])
+    monkeypatch.setattr(spill, "bytes_of", lambda: (living, 0))
     memory = GpuMemory(1.0, model(50), False, torch.device("cuda"))
     memory._limit_torch(800)
     living = 1100
@@ -138,17 +132,15 @@ def test_a_training_leaves_torch_what_it_had(monkeypatch):
     monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: share[-1])
     monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", share.append)
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
-    monkeypatch.setattr(gpu_memory, "_before", [])
-    part = Spill()
-    part.ended(None)
+    monkeypatch.setattr(spill, "_before", [])
+    spill.release_torch()
     assert share == [0.4]
     for limit in (100, 200):
-        gpu_memory.limit_torch(limit, torch.device("cuda"))
-    part.ended(UserError("full"))
+        spill.limit_torch(limit, torch.device("cuda"))
+    spill.release_torch()
     assert share == [0.4, 0.1, 0.2, 0.4]
-    gpu_memory.limit_torch(300, torch.device("cuda"))
-    opt = SimpleNamespace(gpu_memory=0.0, absgrad=False)
-    part.check(SimpleNamespace(gaussians=model(50), opt=opt, device=torch.device("cpu"), strategies=[]), None)
+    spill.limit_torch(300, torch.device("cuda"))
+    assert make_storage(model(50), SimpleNamespace(gpu_memory=0.0), torch.device("cpu"), False) is None
     assert share == [0.4, 0.1, 0.2, 0.4, 0.3, 0.4]
 
 
@@ -174,12 +166,12 @@ def _half_spilled(patch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
     Yields the numbers of rows of the tensors that were made.
     """
-    made, kept, spill, bytes_found = [], [], spilled.OPERATORS.spilled, spilled.OPERATORS.spilled_bytes
+    made, kept, make, bytes_found = [], [], spilled.OPERATORS.spilled, spilled.OPERATORS.spilled_bytes
 
     def stand_in(like: torch.Tensor, rows: int, near: int) -> torch.Tensor:
         made.append(rows)
         if like.is_cuda:
-            return spill(like, rows, near)
+            return make(like, rows, near)
         kept.append((torch.full((rows, *like.shape[1:]), torch.nan), near))
         return kept[-1][0]
 
@@ -193,8 +185,8 @@ def _half_spilled(patch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     patch.setattr(spilled.OPERATORS, "spilled_bytes", found)
     patch.setattr(GpuMemory, "resident_rows", lambda self, count: count // 2)
     patch.setattr(GpuMemory, "_spills", lambda self, count: self.limit > 0)
-    patch.setattr(spill_part, "refuse_without_gpu", lambda device: None)
-    patch.setattr(gpu_memory, "_PAGE", PAGE if torch.cuda.is_available() else 1)
+    patch.setattr(spill, "refuse_without_gpu", lambda device: None)
+    patch.setattr(spill, "_PAGE", PAGE if torch.cuda.is_available() else 1)
     yield made
 
 
@@ -251,7 +243,7 @@ def test_ranks(scene, tmp_path, once):
 @pytest.mark.parametrize(("options", "sleeps"), [((), False), (SPILL, True), ((*SPILL, "--strategy", "mcmc"), False)])
 def test_blocks_sleep_wherever_they_can(scene, tmp_path, monkeypatch, options, sleeps):
     monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
-    monkeypatch.setattr(spill_part, "refuse_without_gpu", lambda device: None)
+    monkeypatch.setattr(spill, "refuse_without_gpu", lambda device: None)
     found, begin = [], run.Run.open
     monkeypatch.setattr(run.Run, "open", lambda self, *x: (found.append(self.sleeping is not None), begin(self, *x)))
     trained(scene, tmp_path, *options)

@@ -25,12 +25,12 @@ from waiting import LIMIT, wait_for
 import full_eval
 from applications.evaluation import report as report_module
 from applications.evaluation.child import Finished, Slot, run_child
+from applications.evaluation.figures import draw_curves
 from applications.evaluation.plan import DATASETS, dataset_scenes, describe_photos
 from applications.evaluation.results import shorter_ends_there
 from arguments import write_cfg_args
 from groundwork.files.json_files import SCHEDULE
 from groundwork.host.interrupt import DeferredInterrupt
-from splatting.records.figures import draw_curves
 from splatting.records.renders import GAIN, ComparedViews
 from utils import lpips_utils
 from utils.system_utils import Terminated, UserError

@@ -8,6 +8,8 @@ from gaussians import pipeline
 import export
 import train
 from applications.demo.make_scene import make_scene
+from applications.export import cleaning
+from applications.export.cleaning import Cleaning, clean
 from benchmarks.exports import cleaning as benchmark
 from benchmarks.exports.cleaning import losses, with_floaters
 from gaussian_renderer.camera_paths.poses import poses_of
@@ -15,8 +17,6 @@ from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of, splats_of
-from splatting import cleaning
-from splatting.cleaning import Cleaning, clean
 from splatting.records.renders import sheet
 from utils.system_utils import UserError
 

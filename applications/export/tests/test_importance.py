@@ -7,9 +7,9 @@ from gaussians import model, pipeline
 import export
 import train
 from applications.demo.make_scene import make_scene
+from applications.export.importance import change_without, most_needed
 from gaussian_renderer.blending import weighted_sums
 from gaussian_renderer.camera_paths.without_scene import circle_cameras
-from gaussian_renderer.importance import change_without, most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from scene.saved_model import load_saved
 from scene.scene import Scene

@@ -13,6 +13,7 @@ from PIL import Image
 
 import export
 import train
+from applications.export import cleaning
 from applications.export.formats import SceneInputs, find_format
 from applications.export.page_start import PICTURE, find_named, write_preview
 from gaussian_renderer import render
@@ -21,7 +22,6 @@ from gaussian_renderer.camera_paths.poses import Poses, poses_of
 from gaussian_renderer.camera_paths.start import LEAST, MOST, best_start, narrow_fov
 from gaussian_renderer.free_view import free_view
 from scene.with_splats import model_of
-from splatting import cleaning
 from utils.system_utils import UserError
 
 

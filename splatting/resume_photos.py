@@ -19,7 +19,10 @@ _CLOSE = 1e-4  # of the extent, and of a rotation's entries: poses that were wri
 
 
 class NewFirst(ViewOrder):
-    """An order of views in which every second iteration after `since`, up to `until`, trains on a photo of `names`."""
+    """An order of views in which every second iteration after `since`, up to `until`, trains on a photo of `names`.
+
+    Checkpoints record the new photos, so that a resumed training has the same order.
+    """
 
     def __init__(self, every: ViewOrder, since: int, until: int, names: list[str]) -> None:
         super().__init__(every.cameras, every.seed)
@@ -33,6 +36,20 @@ class NewFirst(ViewOrder):
             return super().__getitem__(iteration)
         turn, old = divmod(iteration - self._span.start, 2)
         return self._turns[old][turn + 1]
+
+
+def order_views(run: Any, record: Any) -> None:
+    """Let new photos train more often, or those that were new in an earlier run.
+
+    record: record of the checkpoint, or None.
+    """
+    if added := new_photos(run):
+        count, until = len(added["names"]), added["until"]
+        print(f"{count} photos are new; until iteration {until} every second one trains on one of them")
+        run.has_new_photos = True
+    run.added_photos = added or record
+    if run.added_photos is not None:
+        run.views = restored(run.views, run.added_photos)
 
 
 def restored(every: ViewOrder, record: Any) -> ViewOrder:

@@ -16,10 +16,12 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
+from arguments import add_to_model_json
 from groundwork.files.json_files import MODEL_JSON, read_model_json
 from scene.saved_model import saves_in
+from splatting.folder import REPLACED, folder_of, newest_checkpoint, own_folder
 from splatting.iteration import Iteration
-from splatting.part import Error, Part, fill
+from splatting.part import Error, Part
 from splatting.schedule import STEADY
 from utils.system_utils import UserError
 
@@ -33,47 +35,9 @@ _SPEED = 2e8  # bytes that a disk writes in a second, until it has shown how man
 
 
 class Resume(Part):
-    """Writes checkpoints from time to time (--resume), leaves one at the end, and notes that the end was reached.
+    """Writes checkpoints from time to time (--resume), leaves one at the end, and notes that the end was reached."""
 
-    Where a training resumes with more photos, every second iteration trains on a new photo at first. Later checkpoints
-    record the new photos, so that a resumed training has the same order of views.
-    """
-
-    name = "resume"
-    told_last = True  # after the checkpoints that were asked for
-
-    @classmethod
-    def wanted(cls, given: argparse.Namespace) -> bool:
-        return True
-
-    def begin(self, run: Any, state: Any) -> None:
-        from splatting.features.resume_photos import new_photos, restored
-
-        if added := new_photos(run):
-            count, until = len(added["names"]), added["until"]
-            print(f"{count} photos are new; until iteration {until} every second one trains on one of them")
-            fill(run, "has_new_photos", True, self)
-        self._added = added or state
-        if self._added is not None:
-            fill(run, "views", restored(run.views, self._added), self)
-
-    def state(self) -> Any:
-        return self._added
-
-    def ready(self, run: Any) -> None:
-        """Warn that this training replaces a finished one in its folder, once nothing can refuse it."""
-        folder = run.dataset.model_path
-        if run.start is None and run.group.first and (there := finished(folder)):
-            instead = f"; --resume with {there.more} would continue it" if there.checkpoint.is_file() else ""
-            print(
-                f"warning: {folder} has a finished training of {there.iteration:,} iterations, and this one starts "
-                f"over{instead}",
-                file=sys.stderr,
-            )
-
-    def opened(self, run: Any) -> None:
-        from splatting.folder import REPLACED
-
+    def __init__(self, run: Any) -> None:
         self._run, self._file = run, Path(run.scene.model_path) / REPLACED
         self._before = self._spent = 0.0  # seconds of training at the last checkpoint, seconds of writing so far
         self._speed = _SPEED
@@ -130,30 +94,42 @@ class Resume(Part):
             note_finished(self._run)
             self._file.unlink(missing_ok=True)
 
-    @classmethod
-    def prepare(
-        cls, dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace, stops: Mapping[str, bool]
-    ) -> bool:
-        """Choose the checkpoint to start with, if --resume is given. Return whether there is anything to train.
 
-        UserError without a folder, and for a finished training that cannot be continued in this way.
-        """
-        from splatting.folder import folder_of, newest_checkpoint
+def warn_of_finished(run: Any) -> None:
+    """Warn that a training replaces a finished one in its folder, once nothing can refuse it."""
+    folder = run.dataset.model_path
+    if run.start is None and run.group.first and (there := finished(folder)):
+        instead = f"; --resume with {there.more} would continue it" if there.checkpoint.is_file() else ""
+        print(
+            f"warning: {folder} has a finished training of {there.iteration:,} iterations, and this one starts "
+            f"over{instead}",
+            file=sys.stderr,
+        )
 
-        if not getattr(launch, "resume", False):
-            return True
-        folder = dataset.model_path or folder_of(launch.start_checkpoint)
-        if not folder:
-            raise UserError("--resume needs -m, the folder whose training it resumes or starts")
-        asked = next((further for name, further in stops.items() if getattr(opt, name)), None)  # None: by --iterations
-        if end := finished(folder):
-            launch.start_checkpoint = str(end.checkpoint)
-            return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
-        most = opt.iterations if asked is None else math.inf
-        launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
-        if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
-            raise UserError(f"{folder} has a model, and no checkpoint to continue; leave --resume out to start over")
+
+def choose_checkpoint(
+    dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace, stops: Mapping[str, bool]
+) -> bool:
+    """Choose the checkpoint to start with, if --resume is given. Return whether there is anything to train.
+
+    UserError without a folder, and for a finished training that cannot be continued in this way.
+
+    stops: `Part.ends_by` of all parts.
+    """
+    if not getattr(launch, "resume", False):
         return True
+    folder = dataset.model_path or folder_of(launch.start_checkpoint)
+    if not folder:
+        raise UserError("--resume needs -m, the folder whose training it resumes or starts")
+    asked = next((further for name, further in stops.items() if getattr(opt, name)), None)  # None: by --iterations
+    if end := finished(folder):
+        launch.start_checkpoint = str(end.checkpoint)
+        return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
+    most = opt.iterations if asked is None else math.inf
+    launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
+    if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
+        raise UserError(f"{folder} has a model, and no checkpoint to continue; leave --resume out to start over")
+    return True
 
 
 class End(NamedTuple):
@@ -179,8 +155,6 @@ def finished(folder: str | os.PathLike) -> End | None:
 
 def note_finished(run: Any) -> None:
     """Note that a training has reached its end."""
-    from arguments import add_to_model_json
-
     folder = Path(run.scene.model_path)
     if not (folder / MODEL_JSON).is_file():  # the folder was removed meanwhile, which is told of
         return
@@ -195,8 +169,6 @@ def checkpoint_line(path: Path, more: str) -> str:
 
 def _continued(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
     """Tell whether to continue a folder's finished training. UserError if it is impossible, or not by --iterations."""
-    from splatting.folder import REPLACED, own_folder
-
     there = f"{folder} has a finished training of {end.iteration:,} iterations"
     wrong = by_iterations and end.more != STEADY.more
     if not asked and not wrong:

@@ -18,10 +18,10 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from applications.export.importance import change_without
 from gaussian_renderer.blending import weighted_sums
 from gaussian_renderer.camera_paths.without_scene import WithoutScene
 from gaussian_renderer.free_view import FRACTIONS, neighbours, views_between
-from gaussian_renderer.importance import change_without
 from gaussian_renderer.scored_views import ScoredViews
 from groundwork.files.image_files import to_bytes
 from groundwork.files.ours import write_picture

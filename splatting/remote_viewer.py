@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from arguments.features import FEATURES
 from gaussian_renderer import network_gui, render
 from gaussian_renderer.network_message import Request
 from gaussian_renderer.network_transfer import ViewerLost
@@ -26,24 +27,17 @@ class RemoteViewer(Part):
     there.
     """
 
-    name = "remote_viewer"
-    told_last = True
     _asked = False
 
-    @classmethod
-    def wanted(cls, given: argparse.Namespace) -> bool:
-        return True
+    @staticmethod
+    def suits(run: Any) -> bool:
+        """Tell whether a viewer may be served. No process of several can draw a view by itself."""
+        return not (run.group.several or (run.launch.disable_viewer and network_gui.listener is None))
 
-    def begin(self, run: Any, state: Any) -> None:
-        # No process of several can draw a view by itself.
-        self.active = not run.group.several and not (run.launch.disable_viewer and network_gui.listener is None)
-
-    def opened(self, run: Any) -> None:
+    def __init__(self, run: Any) -> None:
         self._run, self._gui = run, network_gui
         if not run.launch.disable_viewer:
-            from arguments.features import FEATURES
-
-            ip, port = FEATURES[self.name].launch[:2]
+            ip, port = FEATURES["remote_viewer"].launch[:2]
             address = run.launch.ip, run.launch.port
             run.resources.enter_context(self._gui.listening(*address, address != (ip.default, port.default)))
 

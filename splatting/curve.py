@@ -1,6 +1,5 @@
 """The curve of error against run time, recorded while the model trains: error_vs_time.csv and .png."""
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,17 +15,8 @@ from utils.system_utils import saved_iterations
 class Curve(Part):
     """Scores test views, and as many training views, in planned iterations, and draws the curve at the end."""
 
-    name = "curve"
-    _recorder: Any = None
-
-    @classmethod
-    def wanted(cls, given: argparse.Namespace) -> bool:
-        return not getattr(given, "no_curve", False)
-
-    def opened(self, run: Any) -> None:
+    def __init__(self, run: Any) -> None:
         self._run, test = run, run.scene.getTestCameras()
-        if not test:
-            return
         trained = [camera for camera in run.scene.getTrainCameras() if camera.columns is None]  # in whole
         views = ScoredViews(run.pipe, run.background, run.scene.halves)
         self._recorder = CurveRecorder(
@@ -50,23 +40,19 @@ class Curve(Part):
             views.load(camera)
 
     def due(self, at: Iteration) -> bool:
-        if self._recorder is None:
-            return False
         run = self._run
         first = run.schedule.step_before(run.first_iteration)
         self._due = self._recorder.due(at.span, first, run.clock.seconds, run.schedule.expected)
         return self._due
 
     def measured(self, at: Iteration, losses: Losses) -> None:
-        if self._recorder is not None and (self._due or at.last):
+        if self._due or at.last:
             self._seconds = at.scored_at = self._run.clock.seconds
             point = self._recorder.point(at.span) or at.span[-1]
             with self._run.clock.paused("scoring"):
                 self._recorder.add(point, self._seconds, self._run.gaussians.gaussian_count, at.iteration)
 
     def ended(self, error: Error) -> None:
-        if self._recorder is None:
-            return
         if error is not None:
             self._recorder.abandon()
             return

@@ -1,16 +1,37 @@
-"""GPU memory of a training: the rows of the SH bands above 0 that lie on the host to keep within a limit."""
+"""A limit of the GPU memory that a training takes (--gpu_memory): SH bands that do not fit lie in the host's memory.
 
+The limit must begin before the first rows exist, because the rows of a checkpoint may not fit on the GPU at all. So the
+model gets its storage while it is empty.
+"""
+
+import argparse
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from groundwork.host.memory import free_memory
+from groundwork.host.memory import free_memory, gib
+from scene import sleeping
 from scene.gaussian_model import GaussianModel
+from scene.gaussians.adam import GaussianAdam
 from scene.gaussians.spilled import Storage, bytes_of, empty_rows, is_spilled
+from scene.in_view import share_of
 from scene.scene import Scene
-from splatting.resources import PER_PIXEL, largest_view, photo_bytes, training_bytes
+from splatting.resources import (
+    PER_PIXEL,
+    REMEDY,
+    announce_device,
+    expected_count,
+    largest_view,
+    photo_bytes,
+    training_bytes,
+    warn_of,
+)
+from utils.system_utils import UserError
 
+_BUS = 40e9  # bytes a second that kernels read or write in the host's memory
+_SLOW = 10.0  # milliseconds a step, from which on the bus is named
 _USABLE = 0.95  # of a GPU's free memory, where nobody has given a limit; torch cannot fill what it holds
 _PAGE = 2 << 20  # bytes; a spilled tensor has whole pages in each memory
 _SPARE = 0.03  # of a limit, what torch cannot fill of its blocks; and at least
@@ -151,3 +172,71 @@ def release_torch() -> None:
     """Let torch take as much as it might before the limit."""
     while _before:
         torch.cuda.set_per_process_memory_fraction(_before.pop())
+
+
+def make_storage(
+    gaussians: GaussianModel, opt: argparse.Namespace, device: torch.device, absolute: bool
+) -> GpuMemory | None:
+    """Return the storage of an empty model on a GPU, which may be too small without the option; None on a CPU.
+
+    absolute: true if the statistics may take absolute gradients.
+    """
+    if opt.gpu_memory:
+        refuse_without_gpu(device.type)
+    release_torch()  # from the limit of a training that was refused after this
+    if device.type != "cuda" and not opt.gpu_memory:
+        return None
+    return GpuMemory(opt.gpu_memory, gaussians, absolute, device)
+
+
+def refuse_without_gpu(device: str) -> None:
+    """Raise UserError where there is no GPU whose memory could be limited."""
+    if device != "cuda":
+        raise UserError("--gpu_memory limits the memory of a GPU, and there is none to use; leave it out")
+
+
+def announce(run: Any, memory: GpuMemory) -> None:
+    """Print how much lies in the host's memory, now or with the most Gaussians to come, and the time that this takes.
+
+    Warn if the host has too little memory for the expected number.
+    """
+    now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size
+    later = expected_count(most, now)
+    if far := memory.host_bytes(-(-later // size)):
+        _announce_host(run.scene.images, far, f"{later:,} Gaussians", size)
+    count = -(-max(now, most) // size)
+    if memory.host_bytes(count):
+        share = share_of(run.scene, run.device)
+        dense = run.sleeping is None and type(run.gaussians.optimizer) is GaussianAdam
+        same = run.sleeping is None or share < sleeping.MOST_SHARE  # blocks would sleep in any case
+        print("\n".join(sentences(memory, count, 1.0 if dense else share, same)))
+
+
+def _announce_host(images: Any, needed: int, what: str, size: int) -> None:
+    """Print the memory that the host needs for spilled rows, beside photos there; warn if it does not fit."""
+    host = torch.device("cpu")
+    pictures = images.planned_bytes if images.keep_on == host else 0
+    each = f" for each of {size} processes" if size > 1 else ""
+    room = announce_device(host, f"{gib(needed)} of {what}{each}", pictures, pictures + needed)
+    if room < needed:
+        warn_of(host, what, f"set a lower --max_num_splats, or {REMEDY}")
+
+
+def sentences(memory: GpuMemory, count: int, seen: float, same: bool) -> list[str]:
+    """Return lines to print before a training of `count` Gaussians of which some are spilled.
+
+    seen: share of the Gaussians that a step concerns.
+    same: true if spilling does not change the files.
+    """
+    spilled = memory.host_bytes(count)
+    said = [
+        f"{gib(spilled)} of {count:,} Gaussians are kept in the host's memory, as all of them need more than "
+        f"{gib(memory.limit)} of the GPU's; the saved files are the same" + ("" if same else " up to rounding")
+    ]
+    milliseconds = 1e3 * 2 * spilled * seen / _BUS
+    if milliseconds > _SLOW:
+        said.append(
+            f"transfers from and to that memory limit the speed to about {milliseconds:.0f} ms a step, which updates "
+            f"{seen:.0%} of the Gaussians"
+        )
+    return said
