@@ -33,10 +33,9 @@ from scene.gaussians.spilled import bytes_of, empty_rows, is_spilled
 from splatting import resources, run
 from splatting.features import spill as spill_part
 from splatting.features import spill_memory as gpu_memory
-from splatting.features.spill import Spill, sentences
+from splatting.features.spill import sentences
 from splatting.features.spill_memory import GpuMemory, resident_rows, spillable_bytes
 from splatting.resources import training_bytes
-from utils.system_utils import UserError
 
 SPILL = ("--gpu_memory", 1)
 ON_A_GPU = pytest.mark.parametrize("_", [pytest.param(None, marks=GPU_MARKS)])
@@ -44,15 +43,6 @@ PAGE = 2 << 20
 
 
 # The policy
-
-
-@pytest.mark.parametrize("limit", [0, 10_000, 530_000, 700_000, 1_300_000, 10**9])
-def test_what_stays_near_fits_beside_all_else(limit):
-    near = resident_rows(limit, 1000, 530_000, 540_000)
-    assert near == (0 if limit <= 530_000 else 1000 if limit >= 1_070_000 else near)
-    if 0 < near < 1000:
-        assert 530_000 + 540 * near <= limit < 530_000 + 540 * (near + 1)
-    assert resident_rows(limit, 1000, 530_000, 0) == 1000  # degree 0 has nothing to spill
 
 
 VIEW = SimpleNamespace(image_width=50, image_height=20)
@@ -114,52 +104,6 @@ def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     assert there.limit == 0 and there.remedy(1000, 1) == ""
 
 
-def test_torch_gets_the_limit_without_the_near_parts(monkeypatch):
-    found, total, living, freed = [], 4 * 2**30, 100, []
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
-    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", lambda share: found.append(share * total))
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 2**30 - 1000)
-    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (total, total))
-    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: freed.append(found[-1:]))
-    monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: 1.0)
-    monkeypatch.setattr(gpu_memory, "_before", [])
-    monkeypatch.setattr(gpu_memory, "bytes_of", lambda: (living, 0))
-    memory = GpuMemory(1.0, model(50), False, torch.device("cuda"))
-    memory._limit_torch(800)
-    living = 1100
-    memory._limit_torch(200)
-    assert found == [2**30 - 100, 2**30 - 800, 2**30 - 1100] and freed == [[2**30 - 800]]
-
-
-def test_a_training_leaves_torch_what_it_had(monkeypatch):
-    """At its end; of one that was refused before it began, when the next one begins."""
-    share, total = [0.4], 1000
-    monkeypatch.setattr(torch.cuda, "get_device_properties", lambda device: SimpleNamespace(total_memory=total))
-    monkeypatch.setattr(torch.cuda, "get_per_process_memory_fraction", lambda: share[-1])
-    monkeypatch.setattr(torch.cuda, "set_per_process_memory_fraction", share.append)
-    monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
-    monkeypatch.setattr(gpu_memory, "_before", [])
-    part = Spill()
-    part.ended(None)
-    assert share == [0.4]
-    for limit in (100, 200):
-        gpu_memory.limit_torch(limit, torch.device("cuda"))
-    part.ended(UserError("full"))
-    assert share == [0.4, 0.1, 0.2, 0.4]
-    gpu_memory.limit_torch(300, torch.device("cuda"))
-    opt = SimpleNamespace(gpu_memory=0.0, absgrad=False)
-    part.check(SimpleNamespace(gaussians=model(50), opt=opt, device=torch.device("cpu"), strategies=[]), None)
-    assert share == [0.4, 0.1, 0.2, 0.4, 0.3, 0.4]
-
-
-def test_the_cpu_has_one_memory():
-    values = torch.ones(4, 3)
-    assert empty_rows(values, 5, 1) is None and bytes_of(values) == bytes_of() == (0, 0) and not is_spilled(values)
-    for rows in (-1, 2**31):
-        with pytest.raises(ValueError, match="at least 0"):
-            empty_rows(values, rows, 0)
-
-
 # Trainings
 
 
@@ -215,7 +159,7 @@ def _check_rows(patch: pytest.MonkeyPatch) -> list[int]:
     return counts
 
 
-@pytest.mark.parametrize("name", ["asleep, default", "asleep, together", "asleep, budget", "sparse", "mcmc"])
+@pytest.mark.parametrize("name", ["asleep, default", "asleep, together", "mcmc"])
 def test_spilled_rows_are_trained_as_any_others(scene, tmp_path, monkeypatch, once, name):
     """Resumed, too: with spilled rows by a training without, and the other way round."""
     expected = whole_result(plain_training(once, name), ITERATIONS)
