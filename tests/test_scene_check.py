@@ -18,7 +18,7 @@ from synthetic import BROWN, HEIGHT, WIDTH, edit_json, make_blender_scene, make_
 from applications.convert.images import find_masks, find_shared_pixels
 from applications.convert.shared_masks import write_shared_masks
 from groundwork.finding import Finding, Severity
-from scene.checks.photo_files import _same_photos, check_blur
+from scene.checks.photo_files import check_blur
 from scene.checks.photos import check_photos
 from scene.checks.scene import check_dataset, findings, report
 from scene.gaussians.copies import clusters_of
@@ -147,13 +147,10 @@ def _before(background: int, size: int = 16) -> list[np.ndarray]:
             "of each photo, at the top and left and right, is",
         ),
         (_sharing(ROWS >= 40, TEXTURE), "17% of each photo, at the bottom, is"),
-        (_sharing((ROWS < 6) & (COLUMNS > 50), 200), "2% of each photo, at the top right, is"),
-        (_sharing((np.abs(ROWS - 24) > 14) | (COLUMNS < 8), TEXTURE), "at the top and bottom and left, is"),
         ([np.where(photo == 7, TEXTURE, photo) for photo in _before(7)], "is the same"),  # a turntable
         (_sharing(ROWS >= 40, TEXTURE)[:4], ""),  # few photos
         (_sharing(ROWS >= 40, TEXTURE)[:2] * 6, ""),  # bursts
         (_before(255), ""),
-        (_before(0), ""),
         (_sharing(ROWS < 0, 0), ""),
         ([np.dstack([photo, np.uint8(255 * ~CORNERS)]) for photo in _sharing(CORNERS, TEXTURE)], ""),  # transparent
     ],
@@ -220,17 +217,8 @@ def test_blurred_photos_are_named_whatever_they_show(sound, tmp_path):
         views.append(replace(view, image_path=path, image_name=path.name))
     info = read(sound)._replace(train_cameras=views)
     (found,) = check_blur(info, 100)
-    text = "4 of the {} photos that were checked look blurred (1.png, 3.png, 5.png, 7.png)"
-    assert found.text == text.format(8)
+    assert found.text == "4 of the 8 photos that were checked look blurred (1.png, 3.png, 5.png, 7.png)"
     assert [*check_blur(info._replace(train_cameras=views[::2]), 100)] == [*check_blur(_with_photos(COLORS), 9)] == []
-    black = [replace(views[0], image_path=tmp_path / "black.png", image_name=f"black{n}") for n in range(8)]
-    Image.new("RGB", (64, 48)).save(tmp_path / "black.png")
-    assert [*check_blur(info._replace(train_cameras=[*views[::2], *black]), 100)] == []
-    for view in views:
-        grey = np.asarray(Image.open(view.image_path).convert("L")).astype(np.uint16) * 257
-        Image.fromarray(grey).save(view.image_path)
-    (found,) = check_blur(info._replace(train_cameras=[*views, *black]), 100)
-    assert found.text == text.format(16)
 
 
 def test_sound_photos_are_passed():
@@ -414,20 +402,6 @@ def test_photos_that_are_there_twice(sound, tmp_path):
     assert "the same picture belongs to cameras in different places (" in said(info._replace(train_cameras=elsewhere))
     same = [replace(view, image_path=copy) for view in info.train_cameras]
     assert "all 17 photos are the same picture" in said(info._replace(train_cameras=same))
-
-
-def test_photos_that_differ_between_what_is_compared_first_are_two(sound, tmp_path):
-    """Photos without compression of a thing that moves a little share much."""
-    views = []
-    for number, view in enumerate(read(sound).train_cameras[:2]):
-        content = bytearray(4 << 20)
-        content[1 << 20] = number
-        path = tmp_path / f"{number}.bmp"
-        path.write_bytes(content)
-        views.append(replace(view, image_path=path))
-    assert [*_same_photos(views)] == [[0], [1]]
-    views[1].image_path.write_bytes(views[0].image_path.read_bytes())
-    assert [*_same_photos(views)] == [[0, 1]]
 
 
 SCENES = (
