@@ -1,12 +1,8 @@
-"""Rules of parts (splatting/part.py): nobody names one outside of its files, and each can be deleted."""
+"""Rules of parts (splatting/part.py): each can be deleted, and two do not fill the same slot."""
 
 import argparse
-import ast
-import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -14,41 +10,12 @@ from forks import fork
 from synthetic import make_colmap_scene
 
 from arguments.features import FEATURES, appearances, strategies
-from splatting.part import Appearance, Part, Strategy, fill, overrides
-from splatting.registry import PARTS, states_in
+from splatting.part import Appearance, Part, Strategy, fill
+from splatting.registry import PARTS
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDER = ROOT / "splatting" / "features"
 ROOMS = ("applications", "arguments", "gaussian_renderer", "groundwork", "scene", "splatting", "utils")
-NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  # what options are read from
-EVALUATION = "applications/evaluation/command.py"
-KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
-    ("time_budget", "applications/nerfbaselines/spec.py"),  # a set of options, as a user gives it
-    ("refine_poses", "scene/checks/fit.py"),  # remedies
-    ("schedule", "splatting/checks.py"),
-    ("no_curve", "applications/nerfbaselines/method.py"),
-    ("no_curve", "applications/doctor/advice.py"),  # of a short training
-    ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
-    ("schedule", "scene/gaussians/reference_names.py"),
-    *((option, "scene/dataset_readers.py") for option in ("depths", "train_test_exp")),  # what the reference's take
-    ("train_test_exp", "scene/cameras.py"),
-    *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
-    *((f"exposure_lr_{end}", EVALUATION) for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
-    ("train_test_exp", EVALUATION),
-    ("viewer", "applications/evaluation/configs.py"),  # nobody would close its page
-    ("viewer", "applications/export/vendor.py"),  # a folder
-    ("port", "applications/viewer/command.py"),
-    ("viewer", "view.py"),  # the application
-    *((option, "applications/viewer/training_page.py") for option in ("viewer", "paused")),  # the page that it opens
-    *((option, "gaussian_renderer/network_gui.py") for option in ("port", "disable_viewer", "viewer")),  # its sentence
-    *(
-        (option, f"applications/{of}.py")  # of own trainings
-        for option in ("disable_viewer", "no_last_checkpoint")
-        for of in ("evaluation/stages", "doctor/advice")
-    ),
-    ("disable_viewer", "applications/nerfbaselines/method.py"),
-}
 CLASSES = {part.name: part for part in PARTS}
 NAMES = [*CLASSES]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
@@ -58,54 +25,9 @@ def _options(name: str) -> set[str]:
     return {*FEATURES[name].by_name} if name in FEATURES else set()
 
 
-def _own(name: str) -> list[Path]:
-    return [FOLDER / f"{name}.py", *FOLDER.glob(f"{name}_*.py")]
-
-
 def _heirs(name: str) -> list[str]:
     """The parts that inherit from a part, as strategies may."""
     return [other for other in NAMES if other != name and issubclass(CLASSES[other], CLASSES[name])]
-
-
-def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: all but its own, its heirs' and the two tables."""
-    found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py") if "tests" not in path.parts)]
-    found += [ROOT / f"{c}.py" for c in COMMANDS]
-    places = [ROOT / "splatting" / "registry.py", ROOT / "arguments" / "features.py"]
-    may = [*places, *(path for one in (name, *_heirs(name)) for path in _own(one))]
-    yield from (path for path in found if path not in may)
-
-
-@cache
-def _nodes(path: Path) -> list[ast.AST]:
-    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-
-
-def _names_of(name: str, path: Path) -> Iterator[str]:
-    """Lines of a file that import a part, or say the name of one of its options."""
-    file = path.relative_to(ROOT).as_posix()
-    options = {option for option in _options(name) if (option, file) not in KNOWN} or {"no option"}
-    called = [node.func for node in _nodes(path) if isinstance(node, ast.Call)]
-    typed = re.compile(rf"--({'|'.join(map(re.escape, sorted(options)))})\b")
-    for node in _nodes(path):
-        if isinstance(node, ast.ImportFrom):
-            module = re.compile(rf"splatting\.features\.{name}(_\w+)?(\.|$)")
-            found = any(module.match(f"{node.module}.{alias.name}") for alias in node.names)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            found = node.value in options or typed.search(node.value)
-        elif isinstance(node, ast.Attribute):
-            of = getattr(node.value, "attr", getattr(node.value, "id", ""))
-            found = node.attr in options and of.strip("_") in NAMESPACES and node not in called
-        else:
-            continue
-        if found:
-            said = getattr(node, "value", "") if isinstance(node, ast.Constant) else getattr(node, "attr", "an import")
-            yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its files"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_nobody_names_a_part_outside_of_its_files(name):
-    assert [line for path in _files(name) for line in _names_of(name, path)] == []
 
 
 def test_options_import_nothing_heavy_and_no_part():
@@ -206,20 +128,6 @@ def test_without_half_of_the_parts_a_training_has_the_bytes_of_one_with_them_off
     whole = once(f"of_all_parts_by_{strategy}", lambda folder: _trained(scene, folder, strategy, "none"))
     ply = whole / "point_cloud/iteration_20/point_cloud.ply"
     assert _trained(scene, tmp_path / "out", strategy, ",".join(hidden)) == ply.read_bytes()
-
-
-@pytest.mark.parametrize(("key", "name"), [("keep_best", "keep_best"), ("best", "keep_best"), ("filter_3d",) * 2])
-def test_a_state_of_no_part_is_refused_by_its_name(key, name):
-    with pytest.raises(UserError, match=f"the checkpoint has a state of {name}, which this code does not have"):
-        states_in({key: {}})
-
-
-def test_hooks_that_are_not_overridden_are_not_called():
-    class Counting(Part):
-        def stepped(self, at: object) -> None: ...
-
-    parts = [Part(), Counting()]
-    assert [hook.__self__ for hook in overrides(parts, "stepped")] == parts[1:] and not overrides(parts, "ended")
 
 
 def test_a_second_provider_of_a_slot_is_refused_with_both_names():
