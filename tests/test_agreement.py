@@ -1,6 +1,7 @@
 """Agreement of a model with the pairs that it was made from, and the ways in which photos are mapped."""
 
 import json
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -212,3 +213,19 @@ def test_pairs_that_mislead(tmp_path, monkeypatch, found, tried, left_out):
     agreeing = dict.fromkeys(("global", "simple", "incremental", "free"), 20)
     done, judged, out = _mapped(tmp_path, monkeypatch, agreeing, photos=20, bound=20, **found)
     assert len(done) == tried and out == left_out and is_wrong(judged[0]) == (not left_out)
+
+
+def test_a_small_model_beside_a_folded_one_is_not_trusted():
+    folded = {"photos": 24, "pairs": 99, "agreeing": 14, "contradicting": 0.04, "alike": ["1", "2"]}
+    small = folded | {"photos": 14, "alike": []}
+    large = folded | {"photos": 22, "agreeing": 22, "alike": []}
+    assert max([folded, small], key=partial(mapping._rank_key, [folded, small])) is folded
+    assert max([folded, large], key=partial(mapping._rank_key, [folded, large])) is large
+
+
+def test_when_a_model_is_called_wrong():
+    right = {"pairs": 90, "contradicting": 0.05, "agreeing": 40, "photos": 42, "bound": 42}
+    assert mapping.is_accepted(right) and not is_wrong(right)
+    assert not mapping.is_accepted(right | {"agreeing": 30}) and not is_wrong(right | {"agreeing": 30})
+    assert is_wrong(right | {"agreeing": 20}) and is_wrong(right | {"contradicting": 0.3})
+    assert not is_wrong({"pairs": 0}) and not mapping.is_accepted({})  # nothing to judge by

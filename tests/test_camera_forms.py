@@ -290,6 +290,25 @@ def test_a_change_in_place_stays_in_copies_and_in_the_target(kind, tmp_path):
     assert torch.equal(camera.original_image, unchanged) and not own.original_image[:, :10].any()
 
 
+@pytest.mark.parametrize("name", ["original_image", "alpha_mask", "invdepthmap", "depth_mask"])
+def test_a_parameter_may_be_assigned_and_anything_deleted(name):
+    camera = _newer(invdepthmap=np.ones((HEIGHT, WIDTH)))
+    photos = getattr(camera, name).clone()
+    parameter = torch.nn.Parameter(torch.full_like(photos, 0.25))
+    setattr(camera, name, parameter)
+    assert getattr(camera, name) is parameter and [n for n, _ in camera.named_parameters()] == [name]
+    for other in (copy.deepcopy(camera), pickle.loads(pickle.dumps(camera))):
+        assert getattr(other, name) is dict(other.named_parameters())[name]
+    if name == "original_image":
+        camera.target(torch.zeros(3)).sum().backward()
+        assert (parameter.grad == 1).all()
+    setattr(camera, name, parameter.detach())
+    assert not list(camera.parameters())
+    setattr(camera, name, parameter)
+    delattr(camera, name)
+    assert torch.equal(getattr(camera, name), photos) and not list(camera.parameters())
+
+
 def test_images_for_other_code_lie_on_the_data_device(monkeypatch):
     computes = torch.device("meta")  # stands for a GPU
     monkeypatch.setattr("scene.view.compute_device", lambda: computes)

@@ -7,21 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from diff_gaussian_rasterization.lens import lens_of
 from gaussians import model, pipeline
 from scipy.spatial.transform import Rotation, Slerp
 
 from gaussian_renderer import render
-from gaussian_renderer.camera_paths.generated import GENERATED, Ellipse, Interpolated, Spiral
+from gaussian_renderer.camera_paths.generated import GENERATED, Ellipse, Interpolated, Spiral, visiting_order
 from gaussian_renderer.camera_paths.keyframes import (
     CameraPath,
     Keyframe,
     KeyframePath,
     TimedPath,
+    frame_count,
+    frame_moment,
     read_camera_path,
 )
-from gaussian_renderer.camera_paths.poses import Poses, look_along
+from gaussian_renderer.camera_paths.poses import Poses, focus_point, look_along, ray_through
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from scene.cameras import Camera
+from scene.readers.info import CameraInfo
+from scene.readers.tracks import projected
 from utils.system_utils import UserError
 
 UP = np.array([0.0, -1.0, 0.0])  # of COLMAP's world, as usual captures have it
@@ -131,6 +136,8 @@ def _two(**changes: object) -> dict:
 
 BROKEN = {
     "": "is not JSON",
+    "\xff": "is not JSON",
+    "[" * 100_000: r"is not JSON \(nested too deep\)",
     "[1]": "needs a list called keyframes",
     json.dumps({"keyframes": [KEY]}): "has 1 keyframes; a camera path needs at least 2",
     json.dumps({"keyframes": [KEY, 5]}): "keyframe 2 must be an object",
@@ -138,9 +145,13 @@ BROKEN = {
     json.dumps({"keyframes": [{**KEY, "seconds": 1}, {**KEY, "seconds": 2}]}): "keyframe 1 must be at 0 seconds",
     json.dumps(_two() | {"easing": "fast"}): "easing must be linear or smooth, got 'fast'",
     json.dumps(_two(fov=0)): "keyframe 2: fov must be 0.001 to 179.9 degrees, got 0",
+    json.dumps(_two(fov=[50])): r"fov must be a number, got \[50\]",
+    json.dumps(_two(fov=True)): "fov must be a number, got True",
     json.dumps(_two(fov=math.nan)): "fov must be a number, got nan",
+    json.dumps(_two(seconds=10**400)): "seconds must be a number, got 1000",
     json.dumps(_two(position=[0, 0])): "position must be 3 numbers",
     json.dumps(_two(position=[0, 0, 2e12])): r"position must be at most 1e\+12 from the origin",
+    json.dumps(_two(position=None)): "position must be 3 numbers, got None",
     json.dumps(_two(wxyz=[0, 0, 0, 0])): "wxyz must be a unit quaternion",
 }
 
@@ -161,6 +172,13 @@ def test_a_file_that_cannot_be_read_is_refused_and_the_example_of_the_docs_is_re
     page = Path(__file__).resolve().parents[1] / "docs" / "guide" / "videos.md"
     (tmp_path / "a.json").write_text(page.read_text(encoding="utf-8").split("```json\n")[1].split("```")[0])
     assert len(read_camera_path(tmp_path / "a.json").keyframes) >= 2
+
+
+def test_frames_of_open_and_of_closed_paths():
+    open_path, closed, odd = KeyframePath(keyframes()), Ellipse(on_ring(12), 2.0), Interpolated(on_ring(12), 1.02)
+    assert [frame_count(path, 30) for path in (open_path, closed, odd)] == [91, 60, 32]
+    assert [frame_moment(open_path, 30, n) for n in (0, 1, 90)] == [0, 1 / 30, 3]
+    assert frame_count(Ellipse(on_ring(12), 0.1), 1) == 1 and frame_moment(odd, 30, 31) == 1.02  # not beyond the end
 
 
 # Paths through the cameras
@@ -191,6 +209,19 @@ def test_interpolate_passes_each_camera_smoothly_at_constant_speed():
     assert fov.min() >= poses.fov.min() and fov.max() <= poses.fov.max()
 
 
+def test_a_walk_is_kept_and_photos_in_no_order_are_not_criss_crossed():
+    walk = on_ring(30)
+    assert visiting_order(walk).tolist() == list(range(30))
+    mixed = np.append(0, 1 + np.random.default_rng(1).permutation(29))
+    visited = mixed[visiting_order(walk[mixed])]
+    around = set((np.diff(visited) % 30).tolist())
+    assert sorted(visited) == list(range(30)) and around in ({1}, {29})
+    # One far jump between two walks is no reason to leave the order.
+    two = walk[np.tile(np.arange(30), 2)]
+    two.positions[30:, 0] += 50
+    assert visiting_order(two).tolist() == list(range(60))
+
+
 def test_interpolate_turns_on_the_spot_the_short_way_merges_equal_poses_and_stays_on_a_line():
     """Quaternions of a full circle change their sign on the way."""
     turns = about_y(0, *range(0, 360, 40), 320, 320).as_matrix()
@@ -206,6 +237,20 @@ def test_interpolate_turns_on_the_spot_the_short_way_merges_equal_poses_and_stay
 
 
 # The focus, and paths around it
+
+
+def test_the_focus_is_the_point_nearest_to_all_axes():
+    target, rng = np.array([0.3, -0.2, 0.5]), np.random.default_rng(0)
+    near(focus_point(on_ring(9, target=target)), target)
+    poses = looking_at(rng.normal(0, 3, (20, 3)), target + rng.normal(0, 0.1, (20, 3)))
+    found = focus_point(poses)
+
+    def error(point: np.ndarray) -> float:
+        return float((np.cross(point - poses.positions, poses.forward) ** 2).sum())
+
+    assert error(found) < min(error(found + 1e-3 * step) for step in (*np.eye(3), *-np.eye(3)))
+    assert focus_point(looking_at(rng.normal(0, 1, (9, 3)), np.array([0, 0, 1e6]))) is None  # parallel
+    assert focus_point(looking_at(poses.positions, 2 * poses.positions)) is None  # outwards
 
 
 def test_the_ellipse_goes_around_at_constant_speed_and_looks_at_the_focus():
@@ -272,3 +317,20 @@ def test_cameras_that_a_path_cannot_be_made_of(name, poses, sentence):
     with pytest.raises(UserError, match=rf"^--path {name} needs .*{sentence}") as refused:
         GENERATED[name](poses, 2.0)
     assert "--path" in str(refused.value).partition(";")[2] and "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "lens",
+    [
+        None,
+        lens_of("OPENCV", (330.0, 340.0, 205.0, 140.0, -0.2, 0.05, 0.01, -0.01)),
+        lens_of("OPENCV_FISHEYE", (150.0, 150.0, 200.0, 150.0, 0.05, -0.01, 0.0, 0.0)),
+    ],
+)
+def test_points_on_the_ray_through_a_place_of_a_photo_are_seen_there(lens):
+    turn, place = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix(), np.array([1.0, 2.0, -3.0])
+    lenses = {"fx": 330.0, "fy": 340.0, "cx": 205.0, "cy": 140.0, "native": lens}
+    info = CameraInfo(0, turn, -turn.T @ place, width=400, height=300, file_size=(800, 600), **lenses)
+    ray = ray_through(Camera(info, (200, 150), 0), 640.0, 120.0)
+    x, y, is_shown = projected(info, (place + 3 * ray / np.linalg.norm(ray))[None])
+    assert is_shown.all() and [*x, *y] == pytest.approx([320, 60], abs=0.03)

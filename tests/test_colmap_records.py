@@ -1,6 +1,7 @@
 """Single files of a COLMAP model against pycolmap, for all of its camera models, and what is said of broken files."""
 
 import importlib.util
+import io
 import shutil
 import struct
 import sys
@@ -147,6 +148,20 @@ def test_without_pycolmap_what_needs_it_is_said(monkeypatch):
         lens.import_pycolmap()
 
 
+def test_an_empty_model_has_no_records(tmp_path):
+    for name, (binary, text) in READERS.items():
+        (tmp_path / "a.bin").write_bytes(bytes(8))
+        (tmp_path / "a.txt").write_text("# nothing\n\n")
+        for records in (binary(tmp_path / "a.bin"), text(tmp_path / "a.txt")):
+            assert len(records) == 0 or [len(part) for part in records] == [0, 0, 0], name
+
+
+def test_a_last_photo_without_its_second_line_has_no_points(tmp_path):
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 7 a.png\n\n2 1 0 0 0 0 0 0 7 b.png")
+    images = loader.read_extrinsics_text(tmp_path / "images.txt")
+    assert [(i.name, i.camera_id, i.xys.shape) for i in images.values()] == [("a.png", 7, (0, 2)), ("b.png", 7, (0, 2))]
+
+
 def test_photos_without_their_second_lines_are_refused(tmp_path):
     """Else every second photo would be read as the points of the one before."""
     lines = [f"{i} 1 0 0 0 {i} 0 0 1 a photo {i}.jpg" for i in (1, 2, 3, 4)]
@@ -203,6 +218,17 @@ def test_foreign_content_is_refused_in_words(folder, tmp_path):
     path.write_bytes(struct.pack("<Qi7di", 1, 1, *range(7), 1) + b"\xff.png\0" + bytes(8))
     with pytest.raises(UserError, match="the name of photo 1 in .* is not UTF-8"):
         loader.read_extrinsics_binary(path)
+    for text, line in (
+        (loader.read_intrinsics_text, "1 PINHOLE 8 6 9 9 4"),
+        (loader.read_intrinsics_text, "1 KODAK 8 6 9 9 4 3"),
+        (loader.read_extrinsics_text, "1 1 0 0 0 0 0 0 7"),
+        (loader.read_extrinsics_text, "1 1 0 0 0 0 0 0 7 a.png\n1 2"),
+        (loader.read_points3D_text, "1 0 0 x 9 9 9 0.5"),
+        (loader.read_points3D_text, "1 0 0 0 9 9 9"),
+    ):
+        path.write_text(f"# comment\n{line}\n")
+        with pytest.raises(UserError, match="line [23] of .*file does not list"):
+            text(path)
 
 
 def test_quaternions_and_matrices():
@@ -237,3 +263,9 @@ def test_dense_maps(tmp_path):
         path.write_bytes(content)
         with pytest.raises(UserError, match="not a complete dense map"):
             loader.read_colmap_bin_array(path)
+
+
+def test_next_bytes():
+    file = io.BytesIO(struct.pack("<idQ", -3, 0.5, 2**40) + struct.pack(">i", 7))
+    assert loader.read_next_bytes(file, 20, "idQ") == (-3, 0.5, 2**40)
+    assert loader.read_next_bytes(file, 4, "i", ">") == (7,)

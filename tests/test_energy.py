@@ -11,7 +11,7 @@ import pytest
 import train
 from groundwork.host.energy import joules_counter
 from splatting.records.model_folder import training_joules
-from splatting.records.training_log import TrainingLog
+from splatting.records.training_log import Stopwatch, TrainingLog
 
 
 class NvmlError(Exception):
@@ -60,6 +60,22 @@ def test_without_nvml_or_its_answer_there_are_none(used, monkeypatch, capfd):
     monkeypatch.setitem(sys.modules, "pynvml", None)
     assert joules_counter(["GPU-a"]) is None
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_stopwatch_counts_no_joules_of_pauses():
+    meter = [100.0]
+    clock = Stopwatch(lambda: meter[0])
+    meter[0] += 7
+    assert clock.joules == 7
+    with clock.paused("scoring"):
+        meter[0] += 1000
+        with clock.paused("saving"):
+            meter[0] += 500
+        assert clock.joules == 7
+    meter[0] += 3
+    assert clock.joules == 10
+    meter[0] = math.nan
+    assert clock.joules is None and Stopwatch().joules is None
 
 
 def _joules(folder: Path) -> list[float | None]:

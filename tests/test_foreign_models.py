@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from gaussian_renderer import GaussianModel, render
 from scene.cameras import MiniCam
+from utils.general_utils import inverse_sigmoid
 from utils.graphics_utils import getProjectionMatrix
 
 WIDTH, HEIGHT = 41, 27
@@ -133,10 +134,21 @@ def test_replaced_activations_are_what_is_rendered():
     torch.testing.assert_close(_image(gaussians), wanted, **CLOSE)
 
 
+def test_activations_have_the_references_names_and_forms():
+    gaussians, x = model(10), torch.tensor([[0.3, 0.6]])
+    assert gaussians.scaling_activation is torch.exp and gaussians.scaling_inverse_activation is torch.log
+    assert gaussians.opacity_activation is torch.sigmoid and gaussians.inverse_opacity_activation is inverse_sigmoid
+    assert torch.equal(gaussians.rotation_activation(x), nn.functional.normalize(x))
+    packed = gaussians.covariance_activation(gaussians.get_scaling, 1.5, gaussians._rotation)
+    assert torch.equal(packed, gaussians.get_covariance(1.5)) and packed.shape == (10, 6)
+    gaussians.opacity_activation = torch.relu
+    assert torch.equal(gaussians.get_opacity, torch.relu(gaussians._opacity)) and not gaussians.kernels_activate
+
+
 # Loops
 
 
-@pytest.mark.parametrize(("restored", "degree"), [(True, 3), (False, 0), (False, 1)])
+@pytest.mark.parametrize(("restored", "degree"), [(False, 3), (True, 3), (False, 0), (False, 1)])
 @pytest.mark.parametrize("kind", ["default", "sparse_adam"])
 def test_every_band_with_a_gradient_trains(kind, restored, degree):
     """Whatever set the degree, and whatever reads the coefficients, such as a regulariser."""
@@ -168,7 +180,7 @@ def test_options_of_the_2023_release_are_enough():
     assert keyword.spatial_lr_scale == 1.5
 
 
-@pytest.mark.parametrize("change", ["slice", "transpose", "plain", "load"])
+@pytest.mark.parametrize("change", ["slice", "transpose", "plain", "cut", "load"])
 def test_tensors_assigned_from_outside_train(change, tmp_path):
     gaussians = model(20)
     if change == "slice":
@@ -179,6 +191,10 @@ def test_tensors_assigned_from_outside_train(change, tmp_path):
     elif change == "plain":
         gaussians._scaling = gaussians.scaling_inverse_activation(gaussians.get_scaling * 0.5)
         gaussians._opacity = gaussians._opacity.detach() * 0.9
+    elif change == "cut":
+        gaussians = model(40)
+        for field in GROUPS.values():
+            setattr(gaussians, field, nn.Parameter(getattr(gaussians, field).detach()[::2]))
     else:
         gaussians.save_ply(tmp_path / "a.ply")
         gaussians = GaussianModel(3)
@@ -201,3 +217,29 @@ def test_tensors_assigned_from_outside_train(change, tmp_path):
 
 
 # Density control
+
+
+def _ready(count: int = 30) -> GaussianModel:
+    """A model of which half is cloned or split: the Gaussians with odd index."""
+    gaussians = model(count)
+    gaussians.xyz_gradient_accum, gaussians.denom = torch.arange(float(count))[:, None] % 2, torch.ones(count, 1)
+    return gaussians
+
+
+@pytest.mark.parametrize("radii", [None, torch.arange(30)])
+def test_an_override_gets_as_many_arguments_as_there_are_values(radii):
+    gaussians, seen = _ready(), []
+
+    class Client(GaussianModel):
+        def densification_postfix(self, *new: Tensor, **others: Tensor) -> None:
+            seen.append(len(new))
+            super().densification_postfix(*new, **others)
+
+        def densify_and_split(self, grads: Tensor, grad_threshold: float, scene_extent: float, N: int = 2) -> None:
+            seen.append("split")
+            super().densify_and_split(grads, grad_threshold, scene_extent, N)
+
+    gaussians.__class__ = Client
+    gaussians.densify_and_prune(0.5, 0.005, 20.0, 20, radii)
+    count = len(STANDARD) + (radii is not None)
+    assert seen == [count, "split", count] and gaussians.tmp_radii is None and len(gaussians) > 30

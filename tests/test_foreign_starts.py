@@ -1,5 +1,6 @@
 """Models of other tools: PLYs of any form, as the start of a training and in render.py; what is refused."""
 
+import gzip
 import json
 import re
 import sys
@@ -20,6 +21,7 @@ import render
 import train
 from applications.export.formats import find_format
 from applications.export.reading import read_any
+from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
 from gaussian_renderer.importance import most_needed
 from gaussian_renderer.scored_views import ScoredViews
 from scene.gaussian_model import GaussianModel
@@ -278,6 +280,28 @@ def test_export_refuses(words, said):
     to = () if "--to" in words else ("--to", "b.ply")
     with pytest.raises(UserError, match=said):
         export.export(*_export_options(*to, *words.split()))
+
+
+def test_a_page_plays_the_camera_path(tmp_path, colmap_scene):
+    _train(colmap_scene, tmp_path / "out")
+    first = Keyframe(0.0, (0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 40.0)
+    last = replace(first, seconds=7.0, position=(1.0, 0.0, -3.0), fov=50.0)
+    CameraPath((first, last)).write(path := tmp_path / "tour.json")
+    export.export(*_export_options("-m", tmp_path / "out", "--to", tmp_path / "page.HTML", "--raw", "--path", path))
+    text = re.search(r'id="page">(.*?)</script>', (tmp_path / "page.HTML").read_text(encoding="utf-8"))[1]
+    (track,) = json.loads(text)["settings"]["animTracks"]
+    fov = track["keyframes"]["values"]["fov"]
+    assert track["duration"] == 7 and (fov[0], fov[-1]) == (40, 50)
+
+
+def test_older_versions_of_spz_need_no_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zstandard", None)
+    words = "--ply", written(tmp_path, ".ply", splats(20)), "--to", tmp_path / "a.spz", "--spz_version"
+    for version in (3, 2):
+        export.export(*_export_options(*words, version))
+        assert gzip.decompress((tmp_path / "a.spz").read_bytes())[4] == version
+    with pytest.raises(UserError, match="needs the package zstandard"):
+        export.export(*_export_options(*words, 4))
 
 
 @pytest.mark.parametrize(("ending", "module"), [(".spz", "zstandard"), (".usdz", "pxr"), (".sog", None)])

@@ -345,3 +345,15 @@ def test_a_header_without_an_end_is_refused_at_once(tmp_path, monkeypatch):
         _loaded(tmp_path / "endless.ply")
     with pytest.raises(UserError, match="no end_header in its first MiB"):
         read_point_cloud(tmp_path / "endless.ply")
+
+
+def test_the_filter_of_mip_splatting_on_extreme_gaussians(tmp_path):
+    """Variances of 3e-26 have a product that no float32 holds."""
+    logits = np.array([5, -5, 90, -90, np.inf, -np.inf, 0, 5, 0, -5], np.float32)
+    widths = np.array([1] * 7 + [0] * 3, np.float32)
+    sizes = {f"scale_{i}": np.float32(-29.4) for i in range(3)}
+    found = read_model(_with(tmp_path, opacity=logits, filter_3D=widths, **sizes))
+    # A faint opacity's logarithm is its logit: that of before, and -29.4 for each axis.
+    faint = -np.logaddexp(0, -logits.astype(float)) - 3 * 29.4
+    np.testing.assert_allclose(found._opacity.detach().numpy()[:, 0], np.where(widths, faint, logits), rtol=1e-6)
+    np.testing.assert_allclose(found._scaling.detach().numpy()[:, 0], np.where(widths, 0, -29.4), rtol=1e-6, atol=1e-6)

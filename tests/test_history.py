@@ -1,5 +1,6 @@
 """Trainings after others: into a folder with a model, from elsewhere, with other options; and the folder's lock."""
 
+import argparse
 import json
 import os
 import re
@@ -12,12 +13,13 @@ from pathlib import Path
 
 import pytest
 from synthetic import folder_state
+from test_arguments import MODEL
 from waiting import wait_for
 
 import train
-from arguments import add_to_model_json, read_model_json
+from arguments import add_to_model_json, read_model_json, write_cfg_args
 from groundwork.files.folders import remove_temporary_files
-from splatting.folder import continue_records, own_folder, records_kept
+from splatting.folder import check_folder, continue_records, own_folder, records_kept
 from splatting.records.error_curve import COLUMNS, read_curve, write_curve
 from utils.system_utils import UserError, atomic_write
 
@@ -292,3 +294,28 @@ def test_records_stay_with_the_model_that_is_saved(tmp_path, saves):
             (tmp_path / "chkpnt3.pth").touch()
         raise ValueError("odd")
     assert (tmp_path / "cfg_args").read_text() == ("new" if saves else "old")
+
+
+@pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5/point_cloud.ply"])
+def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
+    """Write a trained model and a cfg_args that names another scene."""
+
+    def check(source: Path, checkpoint: Path | None = None) -> None:
+        options = MODEL | {"source_path": str(source), "model_path": str(tmp_path)}
+        check_folder(argparse.Namespace(**options), [5], checkpoint and str(checkpoint), 5 if checkpoint else 0)
+
+    scene, other = tmp_path / "scene", tmp_path / "other"
+    scene.mkdir()
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL | {"source_path": str(scene)}))
+    check(other)
+    (tmp_path / trained).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / trained).touch()
+    with pytest.raises(UserError, match=f"holds a model of another scene, {scene}"):
+        check(other)
+    check(scene / ".." / "scene")
+    # Resuming in the same folder is report_changes' to judge.
+    check(other, tmp_path / "chkpnt5.pth")
+    scene.rename(tmp_path / "moved")
+    check(tmp_path / "moved")
+    (tmp_path / "cfg_args").write_text("of another program")
+    check(other)

@@ -114,6 +114,18 @@ def test_decoding_ahead_gives_the_right_pictures_within_the_limit(files, decodin
         assert any(name.startswith("decode") for name in decodings.threads)
 
 
+def test_what_comes_next_is_decoded_meanwhile(files, decodings):
+    store = ImageStore(3)
+    store._workers = 2
+    store.plan(_pictures(files))
+    store.prefetch(_pictures(files[:3]))
+    wait_for(lambda: len(decodings.names) >= 3)
+    assert sorted(decodings.names) == ["0", "1", "2"]
+    for path in files[:3]:
+        store.get(path, SIZE)
+    assert len(decodings.names) == 3 and threading.current_thread().name not in decodings.threads
+
+
 def test_an_error_ahead_comes_at_the_view_that_needs_it(files):
     store = ImageStore(4)
     files[2].write_bytes(files[2].read_bytes()[:40])
@@ -129,6 +141,15 @@ def test_an_error_ahead_comes_at_the_view_that_needs_it(files):
         store.get(files[2], SIZE)
     Image.new("RGB", SIZE, (40, 0, 0)).save(files[2])
     assert store.get(files[2], SIZE)[0, 0, 0] == 40
+
+
+def test_a_limit_that_all_fit_is_none(files):
+    store = ImageStore(10)
+    store.plan(_pictures(files[:8]), _pictures(files[8:]))
+    assert store.limit == 0
+    store = ImageStore(9)
+    store.plan(_pictures(files[:8]), _pictures(files[8:]))
+    assert store.limit == 9 and store.planned_bytes == 9 * 4 * 6 * 4
 
 
 def test_a_gpu_keeps_what_fits_its_share(files, monkeypatch):

@@ -311,3 +311,19 @@ def test_photos_that_colmap_undistorts_where_they_lie_keep_their_profile(colmap_
             written = out / "images" / path.relative_to(colmap_scene / "images")
             assert (decode(written, size).int() - decode(path, size).int()).abs().float().mean() < 2, native
     assert pycolmap.Reconstruction(str(out / "sparse")).num_reg_images() == len(photos)
+
+
+def test_an_alpha_that_hides_nothing_is_dropped(tmp_path):
+    pixels = _noise((8, 8, 4))
+    pixels[..., 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert decode(tmp_path / "a.png", (8, 8)).shape == (3, 8, 8)
+
+
+def test_exif_orientation_is_ignored(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image = Image.fromarray(_noise((10, 20, 3)))
+    image.save(tmp_path / "a.png", exif=exif)
+    assert picture_size(tmp_path / "a.png") == (20, 10)
+    assert torch.equal(decode(tmp_path / "a.png", (20, 10)), _chw(image))

@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,8 +21,10 @@ import render
 import train
 from scene import Scene
 from scene.images.decode import decode
-from scene.images.masks import Mask, MaskOptions, find_masks
+from scene.images.masks import TRANSPARENT, Mask, MaskOptions, find_masks
+from scene.readers.photos import _check_mask
 from splatting.watch import MaskWatch
+from utils.image_utils import pixels_that_count
 from utils.loss_utils import photometric_loss
 from utils.system_utils import UserError
 
@@ -68,6 +71,9 @@ def test_masks_that_leave_out_nothing_or_everything():
     loss, l1 = photometric_loss(image, target, 0.2, torch.zeros_like(mask))
     loss.backward()
     assert loss == l1 == 0 and (image.grad == 0).all()
+    assert pixels_that_count(image, torch.zeros_like(mask)).tolist() == [[0], [0], [0]]
+    assert torch.equal(pixels_that_count(image, mask), image[:, mask[0]])
+    assert pixels_that_count(image, None) is image
 
 
 def _save(path: Path, grey: np.ndarray) -> Path:
@@ -93,10 +99,13 @@ def test_black_is_dark(tmp_path):
 @pytest.mark.parametrize(
     ("dtype", "values", "white"),
     [
+        (np.uint16, (0, 1), 1),
         (np.uint16, (0, 255), 255),
+        (np.uint16, (0, 65535), 65535),
         (np.uint16, (0, 40_000), 40_000),
         (np.uint8, (0, 1), 1),
         (np.uint8, (0, 3), 3),
+        (np.uint8, (0, 100), 100),
         (np.uint8, (1, 0, 2, 3), 1),
         (np.uint8, (0, 0), 1),
     ],
@@ -131,6 +140,13 @@ def test_at_other_sizes_what_counts_is_free_of_what_is_masked(tmp_path, size):
     # Only necessary pixels are lost: 2 and a fraction, at the coarser size, around the masked 33 x 15.
     scale = min(size[0] / 120, 1)
     assert (~counts).sum() <= (max(size[0] / 120, 1)) ** 2 * (33 * scale + 6) * (15 * scale + 6)
+
+
+def test_soft_edges_are_kept_where_they_mean_alpha(tmp_path):
+    path = _save(tmp_path / "m.png", np.arange(0, 64, dtype=np.uint8).reshape(8, 8) * 4)
+    pixels = Mask(path, meaning=TRANSPARENT).decode((8, 8))[0].numpy()
+    np.testing.assert_array_equal(pixels, np.arange(0, 256, 4).reshape(8, 8))
+    np.testing.assert_array_equal(255 - pixels, Mask(path, True, TRANSPARENT).decode((8, 8))[0].numpy())
 
 
 @pytest.fixture
@@ -268,13 +284,17 @@ def test_alpha_is_background_unless_it_is_to_be_ignored(colmap_scene):
     ("change", "said"),
     [
         (lambda masks: masks.rename(masks.parent / "elsewhere"), "no folder .*/masks for --masks; name a folder"),
-        (lambda masks: [path.rename(path.parent / f"mask_{path.name}") for path in masks.rglob("*.*")],
-         "no mask in .*/masks .* belongs to a photo: looked for .*V03.png.png .* name masks like the photos"),
-        (lambda masks: [_save(path, np.zeros((9, 9), np.uint8)) for path in masks.rglob("*.*")],
-         "the mask .* is 9 x 9 pixels and its photo 96 x 64; make masks of the same shape"),
+        (
+            lambda masks: [path.rename(path.parent / f"mask_{path.name}") for path in masks.rglob("*.*")],
+            "no mask in .*/masks .* belongs to a photo: looked for .*V03.png.png .* name masks like the photos",
+        ),
+        (
+            lambda masks: [_save(path, np.zeros((9, 9), np.uint8)) for path in masks.rglob("*.*")],
+            "the mask .* is 9 x 9 pixels and its photo 96 x 64; make masks of the same shape",
+        ),
         (lambda masks: [path.write_bytes(b"x") for path in masks.rglob("*.*")], "cannot read .*/masks/"),
     ],
-)  # fmt: skip
+)
 def test_bad_masks_get_one_sentence(masked_scene, change, said):
     change(masked_scene / "masks")
     with pytest.raises(UserError, match=said):
@@ -366,6 +386,15 @@ def test_views_that_count_are_looked_at_once(capsys):
     said = capsys.readouterr().err
     assert said.count("warning") == 1 and "2 of 4 views" in said and "(v0, v3)" in said
 
+    # Some of thousands of views may have no pixel; a hundred such views are a mistake.
+    views = [view(uid, 0) for uid in range(150)]
+    watch = MaskWatch(views)
+    for one in views[:100]:
+        watch.check(last=False)
+        watch.add(one, one.counted_pixels)
+    with pytest.raises(UserError, match="all 100 views"):
+        watch.check(last=False)
+
 
 def test_scores_are_those_of_the_definition():
     rng = np.random.default_rng(0)
@@ -380,3 +409,12 @@ def test_scores_are_those_of_the_definition():
     hidden = np.where(mask[..., None], shown, 255 - shown)
     for metric in (metrics.ssim, metrics.psnr):
         assert metric(hidden, truth, mask) == metric(shown, truth, mask) != metric(shown, truth)
+
+
+@pytest.mark.parametrize(
+    ("mask", "fits"), [((134, 240), True), ((135, 240), True), ((240, 134), False), ((134, 200), False)]
+)
+def test_a_smaller_mask_may_have_rounded_sides(tmp_path, mask, fits):
+    _save(tmp_path / "mask.png", np.full(mask[::-1], 255, np.uint8))
+    with nullcontext() if fits else pytest.raises(UserError, match="make masks of the same shape"):
+        _check_mask(tmp_path / "mask.png", (269, 480))

@@ -7,13 +7,14 @@ from unittest.mock import DEFAULT, Mock
 
 import pytest
 import torch
-from gaussians import needs_59_values
+from gaussians import model, needs_59_values, options
 
 import train
 from groundwork.host import memory
 from groundwork.host.memory import free_memory, gib, is_out_of_memory
 from scene.images import decode
 from splatting import loop, resources
+from splatting.resources import training_bytes
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).parents[1]
@@ -154,3 +155,18 @@ def test_the_estimate_and_its_warnings(colmap_scene, tmp_path, monkeypatch, capf
     assert f"of {gib(free // 2)}" in line and "for 300 Gaussians; set --images_to_load" in warning
     free = 1 << 40
     assert said() == ("", "")  # nobody has to know
+
+
+def test_the_estimate_counts_what_training_keeps():
+    """The estimate of parameters, moments and a copy of the largest equals torch's own count of the tensors."""
+    gaussians = model(50)
+    gaussians.training_setup(options())
+    tensors = [group["params"][0] for group in gaussians.optimizer.param_groups]
+    for parameter in [*tensors]:
+        gaussians.optimizer.state_of(parameter)
+    tensors.append(max(tensors, key=torch.numel))
+    tensors += [value for state in gaussians.optimizer.state.values() for value in state.values() if value.dim()]
+    counted = sum(tensor.untyped_storage().nbytes() for tensor in tensors)
+    assert training_bytes(gaussians, 50, 0) - 50 * resources.PER_GAUSSIAN == counted
+    more = training_bytes(gaussians, 50, 0, absolute=True) - training_bytes(gaussians, 50, 0)
+    assert more == 50 * resources.PER_ABSOLUTE >= 50 * (4 + 8)  # a length, and a row of two values at least

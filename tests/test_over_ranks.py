@@ -9,10 +9,12 @@ from typing import Any
 import pytest
 import torch
 from diff_gaussian_rasterization import rasterize
+from diff_gaussian_rasterization.scene import draw
 from processes import in_ranks
-from rasterizer_tools import leaves
+from rasterizer_tools import leaves, ops, scene_arguments
 from torch import Tensor
 
+from gaussian_renderer.over_ranks.band import decisive_in, draw_view
 from gaussian_renderer.over_ranks.rasterize import rasterize_over
 from groundwork.ranks.ranks import ranks
 from tests.workloads.splat_scenes import settings
@@ -96,6 +98,28 @@ def test_ranks_render_the_image_and_the_gradients_of_one_process(size):
                     assert torch.equal(whole, values), (number, name)
         seen = (alone["radii"] > 0).any()
         assert seen == (options.get("count", 300) > 0 and not options.get("behind"))
+
+
+def _decisive() -> list[Tensor]:
+    """Return which of this rank's Gaussians are decisive, by case."""
+    here, found = ranks(), []
+    for width, height, options in CASES:
+        parameters, count = _scene(width, height, options), options.get("count", 300)
+        rows = slice(*(count * r // here.size for r in (here.rank, here.rank + 1)))
+        own = scene_arguments({name: t[rows] for name, t in parameters.items()}, settings(width, height, torch.float32))
+        found.append(decisive_in(draw_view(here, own, torch.zeros(3), False, train=True)))
+    return found
+
+
+def test_ranks_find_the_decisive_gaussians_of_one_process():
+    every, shares = in_ranks(3, _decisive), []
+    for number, (width, height, options) in enumerate(CASES):
+        scene = scene_arguments(_scene(width, height, options), settings(width, height, torch.float32))
+        drawn = draw(scene, torch.zeros(3))
+        alone = ops.decisive(drawn.splats, drawn.instances, drawn.ranges, drawn.last)
+        assert torch.equal(torch.cat([of_rank[number] for of_rank in every]), alone)
+        shares.append(alone.float().mean())
+    assert any(0.1 < share < 0.9 for share in shares)
 
 
 def _tensors_left() -> dict[str, int]:

@@ -58,6 +58,22 @@ def test_a_view_made_of_the_references_fields():
         readers.CameraInfo(3, np.eye(3), np.zeros(3), 0.6, 0.8, width=160)
 
 
+def test_replacing_a_field_keeps_what_belongs_together():
+    exact = readers.CameraInfo(1, np.eye(3), np.zeros(3), fx=123.456, fy=78.9, cx=70.5, width=160, height=120)
+    again = dataclasses.replace(exact, T=np.ones(3))
+    assert (again.fx, again.FovX, again.cx, again.cy) == (123.456, readers.focal2fov(123.456, 160), 70.5, 60)
+    info = readers.CameraInfo(**_values(), cx=70.0, mask="mask", file_size=(320, 240))
+    assert info._replace(FovX=0.5).fx == readers.fov2focal(0.5, 160)
+    assert info._replace(fx=100.0).FovX == readers.focal2fov(100.0, 160)
+    half = info._replace(width=80, height=60)
+    assert (half.FovX, half.FovY) == (info.FovX, info.FovY)
+    np.testing.assert_allclose((half.fx, half.fy, half.cx, half.cy), np.array([info.fx, info.fy, 70, 60]) / 2)
+    assert (half.mask, half.file_size) == ("mask", (320, 240))
+    other = info._replace(image_path="none/b.png", image_name="b.png")
+    assert (other.image_path, other.image_name, other.cx) == ("none/b.png", "b.png", 70)
+    assert photo_size(other) == (160, 120)  # of another photo, which is missing
+
+
 def test_a_scene_made_of_the_references_fields():
     cloud = readers.BasicPointCloud(np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 3)))
     views = [readers.CameraInfo(**_values())]

@@ -2,8 +2,9 @@
 
 import json
 import shutil
+import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,7 +16,7 @@ from gaussians import model, pipeline
 from PIL import Image
 
 from applications.viewer.untrained import _make_spheres
-from gaussian_renderer.camera_paths import from_above, render_path
+from gaussian_renderer.camera_paths import from_above, render_path, video
 from gaussian_renderer.camera_paths.keyframes import CameraPath, Keyframe
 from gaussian_renderer.camera_paths.without_scene import WithoutScene, circle_cameras
 from scene.cameras import camera_to_JSON
@@ -70,6 +71,14 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
 
 def written(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file())
+
+
+def patches(count: int, width: int = 64, height: int = 48) -> Iterator[np.ndarray]:
+    """Frames of 16 x 16 pixels of one colour each."""
+    rng = np.random.default_rng(0)
+    for _ in range(count):
+        colours = rng.integers(0, 256, (height // 16, width // 16, 3), np.uint8)
+        yield colours.repeat(16, axis=0).repeat(16, axis=1)
 
 
 # What is written
@@ -211,6 +220,20 @@ def test_an_ffmpeg_that_dies_is_quoted_and_no_file_stays(run, out, tmp_path, mon
         run("--path", "ellipse", "--seconds", 1)
     assert f"({reason}); free space there, or choose another --size or place" in str(refused.value)
     assert written(out / "videos") == []
+
+
+def test_an_interrupted_video_leaves_nothing(tmp_path, monkeypatch):
+    started: list[subprocess.Popen] = []
+    begin = {"Popen": lambda *a, **k: started.append(subprocess.Popen(*a, **k)) or started[-1]}
+    monkeypatch.setattr(video, "subprocess", SimpleNamespace(**vars(subprocess) | begin))
+
+    def frames() -> Iterator[np.ndarray]:
+        yield from patches(3)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        video.write_video(tmp_path / "a.mp4", frames(), 64, 48, 30)
+    assert started[0].returncode is not None and list(tmp_path.iterdir()) == []
 
 
 def test_a_picture_from_above_is_to_scale_whatever_the_height_and_without_what_no_camera_is_above(tmp_path, capsys):

@@ -3,6 +3,7 @@
 import argparse
 import math
 
+import numpy as np
 import pytest
 import torch
 from gaussians import GROUPS, model, pipeline
@@ -10,6 +11,7 @@ from gaussians import GROUPS, model, pipeline
 import gaussian_renderer
 from gaussian_renderer import render
 from scene.cameras import MiniCam
+from scene.gaussian_model import GaussianModel
 from scene.gaussians.exposure import Exposures
 from splatting import scores as report
 from utils.graphics_utils import getProjectionMatrix
@@ -65,6 +67,21 @@ def test_features_are_rendered_beside_colours(camera):
             render(camera, gaussians, pipeline(), BLACK, features=wrong)
 
 
+def test_depth_unless_it_is_not_wanted(camera):
+    gaussians = model(1)
+    with torch.no_grad():
+        gaussians._xyz.zero_()
+        gaussians._scaling.fill_(math.log(0.5))
+        gaussians._opacity.fill_(0.0)
+    background = torch.tensor([0.1, 0.5, 0.9])
+    empty = render(camera, GaussianModel(3), pipeline(), background)["render"]
+    assert torch.equal(empty, background[:, None, None].expand(3, HEIGHT, WIDTH))
+    depth = render(camera, gaussians, pipeline(), BLACK)["depth"]
+    assert depth.requires_grad  # test_rasterizer_gradients.py has its derivative
+    assert render(camera, gaussians, pipeline(), BLACK, want_depth=False)["depth"] is None
+    assert depth.max().item() == pytest.approx(0.5 / 3.0, rel=0.01)  # opacity / distance, at the nearest pixel centre
+
+
 def _report(camera, draw, *more: object, halves: bool = False) -> dict[str, float]:
     """Scores of a training report whose views are this camera's, five of training and one of test."""
     camera.target, camera.counted_pixels, camera.image_name = lambda _: torch.ones(3, HEIGHT, WIDTH), None, "a"
@@ -115,6 +132,25 @@ def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(ca
     assert gradients[0].any() and torch.equal(2 * gradients[0], gradients[1])
 
 
+@pytest.mark.parametrize(
+    "name", ["separate_sh", "use_trained_exp", "clamp", "convert_SHs_python", "compute_cov3D_python"]
+)
+def test_flags_of_a_call_and_of_the_pipeline_are_checked(camera, name):
+    def draw(flag: object) -> None:
+        of_pipe = name.endswith("python")
+        options = pipeline()
+        if of_pipe:
+            setattr(options, name, flag)
+        render(camera, model(3), options, BLACK, **{} if of_pipe else {name: flag})
+
+    for flag in (1, np.True_, torch.tensor(True)):
+        if not (name == "separate_sh" and torch.is_tensor(flag)):  # which is override_color in 2023's form
+            draw(flag)
+    for wrong in ("no", 2, []):
+        with pytest.raises(TypeError, match=f"{name} must be True or False, got"):
+            draw(wrong)
+
+
 def test_values_outside_are_clamped_and_get_no_gradient(camera):
     gaussians = model(1)
     with torch.no_grad():
@@ -148,6 +184,28 @@ def test_the_raw_path_equals_the_plain_one(camera, degree, antialiasing):
     for name, gradient in plain_gradients.items():
         if gradient is not None and gradient.numel():
             assert (raw_gradients[name] - gradient).abs().max() < 1e-5 * gradient.abs().max(), name
+
+
+def test_inactive_bands_are_not_read(camera):
+    gaussians = model(20, active=False)
+    image = render(camera, gaussians, pipeline(), BLACK)["render"]
+    with torch.no_grad():
+        gaussians._features_rest.fill_(torch.nan)
+    again = render(camera, gaussians, pipeline(), BLACK, want_inactive_bands=False)["render"]
+    assert torch.equal(image, again)
+    again.sum().backward()
+    assert gaussians._features_rest.grad is None
+    again = render(camera, gaussians, pipeline(), BLACK)["render"]
+    assert torch.equal(image, again)
+    again.sum().backward()
+    assert torch.equal(gaussians._features_rest.grad, torch.zeros_like(gaussians._features_rest))
+    gaussians.oneupSHdegree()
+    with torch.no_grad():
+        gaussians._features_rest[:, :3] = 0.0
+    image = render(camera, gaussians, pipeline(), BLACK)["render"]
+    assert torch.equal(image, again)
+    image.sum().backward()
+    assert gaussians._features_rest.grad[:, :3].any() and not gaussians._features_rest.grad[:, 3:].any()
 
 
 def test_exposure_maps_row_vectors_before_the_clamp(camera):

@@ -18,7 +18,7 @@ from synthetic import BROWN, HEIGHT, WIDTH, edit_json, make_blender_scene, make_
 from applications.convert.images import find_masks, find_shared_pixels
 from applications.convert.shared_masks import write_shared_masks
 from groundwork.finding import Finding, Severity
-from scene.checks.photo_files import check_blur
+from scene.checks.photo_files import _same_photos, check_blur
 from scene.checks.photos import check_photos
 from scene.checks.scene import check_dataset, findings, report
 from scene.gaussians.copies import clusters_of
@@ -455,3 +455,17 @@ def test_records_of_other_readers_are_judged(sound):
     plain = [argparse.Namespace(**{name: getattr(view, name) for name in names}) for view in info.train_cameras]
     plain[0].FovX = 3.1
     assert "1 cameras have odd opening angles" in said(info._replace(train_cameras=plain))
+
+
+def test_photos_that_differ_between_what_is_compared_first_are_two(sound, tmp_path):
+    """Photos without compression of a thing that moves a little share much."""
+    views = []
+    for number, view in enumerate(read(sound).train_cameras[:2]):
+        content = bytearray(4 << 20)
+        content[1 << 20] = number
+        path = tmp_path / f"{number}.bmp"
+        path.write_bytes(content)
+        views.append(replace(view, image_path=path))
+    assert [*_same_photos(views)] == [[0], [1]]
+    views[1].image_path.write_bytes(views[0].image_path.read_bytes())
+    assert [*_same_photos(views)] == [[0, 1]]

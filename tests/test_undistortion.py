@@ -211,6 +211,16 @@ def test_alpha_is_undistorted_or_ignored(tmp_path):
     assert kept.mask is None and ((counts == 255) <= (alpha == 255)).all() and (counts == 255).any()
 
 
+def test_a_real_distorted_scene(shared_dir):
+    info = read(shared_dir / "scenes" / "fox_raw")
+    assert len(info.train_cameras) == 12 and len(info.point_cloud.points) == 5115
+    for camera in info.train_cameras:
+        assert camera.mask is None and camera.file_size == (camera.width, camera.height)
+        # COLMAP keeps focal lengths; this lens has almost no distortion, so sizes stay similar too.
+        with Image.open(shared_dir / "scenes" / "fox_raw" / "images" / camera.image_name) as image:
+            assert abs(image.width - camera.width) < 0.05 * image.width
+
+
 def test_a_wide_lens_in_a_scene(tmp_path, capsys):
     """Pixels that the photo does not show do not count."""
     folder = tmp_path / "scene"

@@ -20,7 +20,7 @@ from groundwork.ranks.rows import WHOLE
 from scene.cameras import MiniCam
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adc import remove_useless
-from scene.gaussians.density_rules import default_budget
+from scene.gaussians.density_rules import band_rate, default_budget
 from scene.gaussians.long_axis import long_axis_children
 from scene.saved_model import read_model
 from splatting.checks import another_number
@@ -310,3 +310,15 @@ def test_a_number_out_of_reach_is_told(strategy, number, changes, first, said):
     control = _control(Schedule(160), strategy=strategy, max_num_splats=number, **changes)
     told = another_number(control, control._opt, 300, first)
     assert told is None if said is None else said in str(told)
+
+
+@pytest.mark.parametrize(("iterations", "beta2"), [(30_000, 0.995), (7_500, 0.99), (300, 0.95), (10, 1 - 1 / 16)])
+def test_fewer_iterations_average_squared_gradients_over_fewer(iterations, beta2):
+    block = Block(iterations, 0.0, 1 / iterations, 0.0)
+    for schedule in (Schedule(iterations), DecidedSchedule(Decided(30_000, [block], iterations, 0.0))):
+        assert begun("budget", schedule=schedule).beta2(iterations) == pytest.approx(beta2)
+
+
+def test_bands_learn_slowly_from_few_photos():
+    assert [band_rate([None] * count) for count in (10, 50, 75, 100, 1000)] == [0.2, 1.0, 1.5, 2.0, 2.0]
+    assert begun("budget").band_rate == begun("mcmc").band_rate < 1

@@ -22,6 +22,7 @@ from scene.readers.info import exposure_names
 from splatting.features.exposure import train_on_all
 from splatting.records.error_curve import read_curve
 from splatting.registry import states_in
+from utils.general_utils import get_expon_lr_func
 from utils.loss_utils import inverse_depth_loss, l1_loss, photometric_loss, ssim
 from utils.system_utils import UserError
 
@@ -56,6 +57,16 @@ def test_names_clash_only_where_they_are_made_to():
     blender = _infos("train/r_0.png", "train/r_1.png", "test/r_0.png", stems=True)
     assert exposure_names(blender) == ["train/r_0.png", "r_1", "test/r_0.png"]
     assert exposure_names([]) == []
+
+
+def test_the_optimiser_has_the_references_schedule_and_torchs_constants():
+    exposures = _trained(steps=0, exposure_lr_delay_steps=50, exposure_lr_delay_mult=0.1)
+    rate = get_expon_lr_func(0.01, 0.001, 50, 0.1, max_steps=100)
+    for t in (0, 30, 100):
+        exposures.update_learning_rate(t)
+        assert exposures.optimizer.param_groups[0]["lr"] == rate(t)
+    theirs = torch.optim.Adam([torch.zeros(1)]).defaults
+    assert all(exposures.optimizer.defaults[name] == theirs[name] for name in ("betas", "eps"))
 
 
 # exposure.json
@@ -156,6 +167,13 @@ def test_a_model_without_a_scene_takes_the_checkpoints_photos():
     other.restore(gaussians.capture(), options())
     assert list(other.exposure_mapping) == NAMES and torch.equal(other.get_exposure, gaussians.get_exposure)
     assert other.exposure_optimizer.state[other._exposure]["step"] == 3
+    renamed = GaussianModel(3)
+    renamed.start_exposures(_infos("d.png"))
+    for names, each in ((NAMES, renamed), ("abc", GaussianModel(3)), ([["a"], "b", "c"], GaussianModel(3))):
+        capture = list(gaussians.capture())
+        capture[10][EXPOSURES]["names"] = names
+        with pytest.raises(UserError, match="exposures are of other photos"):
+            each.restore(capture, options())
 
 
 def test_checkpoints_carry_them_within_the_references_entries(tmp_path):
@@ -299,6 +317,10 @@ def test_what_is_scored_does_not_train(colmap_scene, tmp_path):
         pixels[:, 64:] = 255 - pixels[:, 64:]  # only a third, so that resizing does not affect the left half
         Image.fromarray(pixels).save(path)
     assert _train(colmap_scene, tmp_path / "b", iterations=40).read_bytes() == plain.read_bytes()
+    for path, pixels in changed.items():
+        pixels[:, :32] = 255 - pixels[:, :32]
+        Image.fromarray(pixels).save(path)
+    assert _train(colmap_scene, tmp_path / "c", iterations=40).read_bytes() != plain.read_bytes()
 
 
 @pytest.mark.parametrize("damaged", [[{}], 5, {"kind": []}])

@@ -67,6 +67,34 @@ def test_a_photo_is_what_the_formulas_say():
         np.testing.assert_allclose(appearance.shown(image, name).numpy(), expected, atol=2e-6)
 
 
+def test_gradients_are_those_of_differences():
+    appearance, generator = _random(), torch.Generator().manual_seed(1)
+    image = torch.rand(3, 4, 5, dtype=torch.float64, generator=generator).requires_grad_()
+    numbers = {name: values.double().requires_grad_() for name, values in appearance.numbers.items()}
+
+    def shown(image: torch.Tensor, *values: torch.Tensor) -> torch.Tensor:
+        appearance.numbers = dict(zip(numbers, values, strict=True))
+        return appearance.shown(image, "a.png")
+
+    photos, vignetting, middle, response = numbers.values()
+    photos, response = photos.detach(), response.detach()
+    assert torch.autograd.gradcheck(
+        lambda *some: shown(some[0], photos, *some[1:], response), (image, vignetting, middle)
+    )
+    # A mean over photos counts as a constant, as if it were taken out after each step: other rows make up for it here.
+    for name in ("photos", "response"):
+        values, step = numbers[name], 1e-5
+        (gradient,) = torch.autograd.grad(shown(image, *numbers.values()).sum(), values)
+        assert gradient[1].any() and not gradient[0].any()
+        change = torch.zeros_like(values)
+        for place in np.ndindex(values.shape[1:]):
+            change[(1, *place)], change[(0, *place)] = step, -step / (2 if name == "response" else 1)
+            ends = [numbers | {name: values.detach() + sign * change} for sign in (1, -1)]
+            up, down = (shown(image, *end.values()).sum().item() for end in ends)
+            assert gradient[(1, *place)].item() == pytest.approx((up - down) / (2 * step), rel=1e-5, abs=1e-8)
+            change.zero_()
+
+
 def test_photos_count_from_their_mean_after_every_step_and_nothing_is_learnt_while_held():
     appearance = _random()
     appearance.training_setup(options(iterations=10))

@@ -31,7 +31,7 @@ from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_grad
 from scene.scene import Scene
 from splatting.features import refine_poses_steps as refinement
 from splatting.features.refine_poses import NAME, with_poses
-from splatting.features.refine_poses_steps import PoseRefinement
+from splatting.features.refine_poses_steps import BoundedAdam, PoseRefinement
 from utils.graphics_utils import camera_center, world_to_camera
 from utils.system_utils import UserError
 
@@ -104,9 +104,13 @@ def test_tracks_find_a_pose_again(noise):
     assert np.abs(moved_pose(POSE, TURN, 1.0) - POSE).max() > 0.03
 
 
+def test_a_camera_with_all_points_behind_it_stays():
+    behind = np.diag([-1.0, 1, -1, 1]) @ POSE
+    assert nearest_pose(behind, _track(), 500.0, 1.0, BOUND) is behind
+
+
 def test_a_pose_may_stay():
-    away, behind = moved_pose(POSE, TURN, 1.0), np.diag([-1.0, 1, -1, 1]) @ POSE
-    assert nearest_pose(behind, _track(), 500.0, 1.0, BOUND) is behind  # of all points
+    away = moved_pose(POSE, TURN, 1.0)
     assert nearest_pose(away, None, 500.0, 1.0, BOUND) is away
     assert nearest_pose(away, _track(), 500.0, 1.0, 0.01) is away  # farther than the bound
     noisy, near = _track(200, 1e-3), moved_pose(POSE, 1e-3 * TURN, 1.0)
@@ -268,6 +272,20 @@ def test_the_gradient_of_a_twist(tmp_path):
     np.testing.assert_allclose(got, unit * twist.grad, rtol=1e-5, atol=1e-5)
 
 
+def test_bounded_adam_is_torchs(monkeypatch):
+    monkeypatch.setattr(refinement, "BOUND", 10.0)
+    mine, rates = BoundedAdam(2), [0.1, 0.05, 0.02]
+    value = torch.zeros(6, dtype=torch.float64, requires_grad=True)
+    theirs = torch.optim.Adam([value], betas=(0.9, 0.99), eps=1e-12)
+    for rate in rates:
+        gradient = np.random.default_rng(int(100 * rate)).normal(size=6)
+        mine.step(1, gradient, rate)
+        theirs.param_groups[0]["lr"], value.grad = rate, torch.from_numpy(gradient)
+        theirs.step()
+    np.testing.assert_allclose(mine.values[1], value.detach().numpy(), rtol=1e-12)
+    assert not mine.values[0].any()
+
+
 def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
@@ -283,6 +301,18 @@ def test_steps_are_bounded_and_follow_the_gradient(tmp_path, monkeypatch):
     poses._tracked.held[1] = None
     poses.step(1, np.ones(34), 0)
     assert np.array_equal(poses.twists, before)
+
+
+def test_a_pose_depends_on_its_own_steps_and_on_whole_passes(tmp_path):
+    make_colmap_scene(tmp_path)
+    _, poses = _refinement(tmp_path)
+    count = len(poses.twists)
+    assert poses.independent(2, [0, 1]) == 2 and poses.independent(1, [0, 1, 1, 0, 2]) == 2
+    whole = [0] * (refinement._PASSES * count)
+    assert poses.independent(2, whole) == 0 and poses.independent(2, [*whole, 0, 1]) == 2
+    assert poses.independent(2, whole[1:]) == len(whole) - 1
+    poses.step(0, np.zeros(34), 0)
+    assert poses.independent(2, whole[1:]) == 0 and poses.independent(0, [*whole, 0, 1]) == 1
 
 
 @pytest.fixture(scope="module")

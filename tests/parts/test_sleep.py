@@ -25,11 +25,13 @@ from trainings import (
     OPTIONS,
     before_steps,
     differences,
+    narrow_scene,
     plain_training,
     shared_scene,
     sleep,
     trained,
     whole_result,
+    with_clusters,
 )
 
 import train
@@ -39,7 +41,9 @@ from scene.gaussian_model import GaussianModel
 from scene.gaussians.checkpoint import extra_state, load_checkpoint, save_checkpoint
 from scene.readers.point_cloud import write_point_cloud
 from scene.saved_model import read_model
-from scene.sleeping import BLOCK
+from scene.sleeping import BLOCK, REST
+from splatting import run as runs
+from splatting.faster import captured
 from splatting.iteration import Iteration
 from splatting.log import ProgressBar
 from splatting.objective import Objective
@@ -47,6 +51,7 @@ from utils.system_utils import UserError
 
 BETAS, EPS = (0.9, 0.999), 1e-15
 MOST_RATIO = 0.1 / math.sqrt(0.001 * (1 - 0.81 / 0.999))  # of |m| / sqrt(v) (csrc/math/sleep.h)
+SCENES, STEPS = 6, (5, 60)  # of random blocks; 1000, or 1 and (7000, 7001), to measure the rounding
 VIEWS = 12  # random ones of each lens; 1000 for a thorough test
 
 
@@ -129,6 +134,24 @@ def test_missed_steps_are_those_without_a_gradient(device, dtype, missed):
         assert (value - other).abs().max() <= most * (1 + (other - old).abs().max())
     for one, other in zip(slept.averages, dense.averages, strict=True):
         torch.testing.assert_close(one, other, rtol=10 * most, atol=0)
+
+
+@BOTH_AND_GPU
+@pytest.mark.parametrize("mean", [math.nan, math.inf])
+def test_a_value_whose_missed_steps_are_not_finite_stays(device, dtype, mean):
+    place = {"device": device, "dtype": dtype}
+    slept = Blocks(_rows(300, torch.Generator().manual_seed(0), place))
+    before = [value.clone() for value in slept.values]
+    slept.averages[0][7] = mean
+    slept.averages[7].fill_(1.0)
+    slept.terms[:, 1] = math.inf  # as of a rate that has overflown
+    slept.averages[1].fill_(1.0)
+    for step in slept.steps:
+        step += 5
+    slept.wake(_away(place), True, 0.01)
+    assert all(map(torch.equal, slept.values[:2], before[:2]))
+    assert slept.averages[0][7].isnan().all() and slept.averages[1].isnan().all()  # as an ordinary step marks them
+    assert not slept.averages[0][:7].isnan().any()
 
 
 def _clusters(rng: np.random.Generator, place: dict, blocks: int = 24, small: bool = False) -> Blocks:
@@ -217,6 +240,42 @@ def test_no_view_shows_a_block_that_sleeps(device, name, rays, dtype=torch.float
         assert min(asleep, woken) > 0.1 * (asleep + woken)
 
 
+def test_no_view_shows_a_block_that_sleeps_in_double():
+    test_no_view_shows_a_block_that_sleeps("cpu", "barrel", False, torch.float64)
+
+
+def test_steps_with_sleep_are_those_of_dense_adam_in_double():
+    """Gaussians that a view sees have random gradients. No other row has a gradient, or is seen."""
+    place, rng, worst = {"device": "cpu", "dtype": torch.float32}, np.random.default_rng(11), [0.0, 0.0]
+    for _ in range(SCENES):
+        slept = _clusters(rng, place, blocks=6)
+        dense = Blocks([value.double() for value in slept.values])
+        dense.averages, dense.steps = [x.double() for x in slept.averages], [x.clone() for x in slept.steps]
+        for number in range(1, 1 + int(rng.integers(*STEPS))):
+            rate, at = 10 ** rng.uniform(-5, -2.5), int(rng.integers(len(slept.values[0])))
+            camera = _looking(rng, slept.values[0][at].numpy(), place)
+            slept.wake(camera, False, rate)
+            rows = slept.awake.bool().repeat_interleave(BLOCK)[: len(slept.values[0])]
+            *_, radii = OPERATORS.project(*slept.scene(camera))
+            assert not ((radii > 0) & ~rows).any()
+            gradients = [1e-3 * torch.randn_like(v) * (radii > 0).view(-1, *[1] * (v.dim() - 1)) for v in slept.values]
+            moved = [*slept.values, *slept.averages]
+            parts = [values[rows] for values in (*moved, *gradients)]
+            lists = parts[:6], parts[18:], parts[6:12], parts[12:18], slept.steps, [rate] * 6
+            adam_(*lists, *BETAS, EPS, [-1] * 6)
+            for values, part in zip(moved, parts[:18], strict=True):
+                values[rows] = part
+            dense.step([gradient.double() for gradient in gradients], rate)
+            if number % REST == 0:
+                slept.wake(camera, True, rate)
+        slept.wake(camera, True, rate)
+        for one, other in zip(slept.values, dense.values, strict=True):
+            worst[0] = max(worst[0], float(((one - other).abs() / (1 + other.abs())).max()))
+        for one, other in zip(slept.averages, dense.averages, strict=True):
+            worst[1] = max(worst[1], float((one - other).abs().max() / other.abs().max()))
+    assert worst[0] < 2e-6 and worst[1] < 4e-6, worst
+
+
 # Trainings
 
 
@@ -241,6 +300,13 @@ def plain(once) -> Path:
     return plain_training(once, "asleep, default")
 
 
+def test_fast_steps_with_a_lens(tmp_path, take_as, shares):  # noqa: F811
+    scene = with_clusters(narrow_scene(tmp_path / "scene", "OPENCV", (-0.2, 0.05, 0.001, -0.002)), 1000, 30, 200)
+    expected = _trained(scene, tmp_path / "plain", "--plain_step")
+    take_as("captured")
+    assert not differences(_trained(scene, tmp_path / "fast"), expected) and min(shares) < 0.9
+
+
 def _in_rank(scene: Path, out: Path, *options: object) -> dict:
     with sleep(2.0):
         try:
@@ -257,6 +323,17 @@ def test_a_rank_without_rows(scene, tmp_path):
     words = "--init_pcd_path", few
     result, _ = in_ranks(2, _in_rank, scene, tmp_path / "ranks", *words)
     assert not differences(result, _trained(scene, tmp_path / "alone", *words))
+
+
+def test_rays_have_the_bytes_of_a_training_in_which_nothing_sleeps(scene, tmp_path, monkeypatch):
+    """Also with scores and saves between, and resumed."""
+    words = *OPTIONS["together"], *OPTIONS["rays"]
+    looks = "--test_iterations", 3, 17, 31, "--save_iterations", 9, "--checkpoint_iterations", 33, ITERATIONS
+    looked = _trained(scene, tmp_path / "a", *words, *looks)
+    resumed = _trained(scene, tmp_path / "b", *words, "--start_checkpoint", tmp_path / "a/chkpnt33.pth")
+    monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
+    awake = _trained(scene, tmp_path / "awake", *words)
+    assert looked["ply"] == resumed["ply"] == awake["ply"]
 
 
 DAMAGE = {
@@ -297,8 +374,9 @@ def test_interrupted(scene, tmp_path, plain, monkeypatch, take_as, way):  # noqa
     assert not differences(_trained(scene, tmp_path / "whole", *start), whole_result(plain, ITERATIONS))
 
 
-def test_the_model_before_a_loss_of_nan_has_the_missed_steps_up_to_there(scene, tmp_path, monkeypatch):
-    words = "--densification_interval", 1000
+@pytest.mark.parametrize("way", [(), ("--plain_step",)])
+def test_the_model_before_a_loss_of_nan_has_the_missed_steps_up_to_there(scene, tmp_path, monkeypatch, way):
+    words = *way, "--densification_interval", 1000
     _trained(scene, tmp_path / "good", *words, "--checkpoint_iterations", 31, ITERATIONS)
     call = Objective.__call__
 
@@ -327,6 +405,32 @@ def test_a_term_that_somebody_adds_to_the_loss_reaches_all_rows(scene, tmp_path,
     asleep = _trained(scene, tmp_path / "asleep", *way)
     monkeypatch.setattr(sleeping, "MOST_SHARE", 0.0)
     assert not differences(asleep, _trained(scene, tmp_path / "awake", *way))
+
+
+@needs_fused_step
+@pytest.mark.parametrize("way", ["queued", "captured"])
+def test_a_term_ends_no_sleep_before_the_queued_steps_are_done(scene, tmp_path, monkeypatch, take_as, way):  # noqa: F811
+    """Once a step has halted for lack of room, a rest would do nothing, and what blocks have missed would be lost."""
+    made, calls, done, ends = [], [], [], []
+    make, call, end = Objective.__init__, Objective.__call__, runs.Run.stop_skipping
+    monkeypatch.setattr(Objective, "__init__", lambda self, run: (made.append(run), make(self, run))[1])
+
+    def more(self: Objective, package: dict, at: Iteration) -> object:
+        losses = call(self, package, at)
+        calls.append(1)
+        return losses._replace(total=losses.total + (len(calls) > 10) * made[-1].gaussians.get_opacity.mean())
+
+    class Queue(Immediate):
+        def __init__(self, *arguments: object) -> None:
+            super().__init__(*arguments)
+            self.discard = lambda: done.append(1)
+
+    monkeypatch.setattr(Objective, "__call__", more)
+    monkeypatch.setattr(runs.Run, "stop_skipping", lambda self, *x: (ends.append(len(done)), end(self, *x))[1])
+    take_as(way)
+    monkeypatch.setattr(captured, "Speculation", Queue)
+    _trained(scene, tmp_path)
+    assert done and ends and all(ends)
 
 
 def test_no_block_sleeps_where_a_report_may_change_the_model_or_it_has_activations_of_its_own(

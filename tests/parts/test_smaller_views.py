@@ -19,6 +19,8 @@ from scene.gaussian_model import GaussianModel
 from scene.images.sizes import shrink_mask, shrink_photo, shrink_values
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo
+from splatting.features.time_budget import Sizes, smaller
+from splatting.features.time_budget_schedule import PYRAMID, Block, Decided, DecidedSchedule
 
 
 def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianModel]:
@@ -27,6 +29,12 @@ def _scene(folder: Path, out: Path, **options: object) -> tuple[Scene, GaussianM
     )
     gaussians = GaussianModel(args.sh_degree)
     return Scene(args, gaussians, shuffle=False), gaussians
+
+
+def _schedule(length: int) -> DecidedSchedule:
+    """A schedule with smaller views at first."""
+    block = Block(length, 0.0, 1 / length, 0.0)
+    return DecidedSchedule(Decided(length, [block], length, 0.0, "pyramid", PYRAMID))
 
 
 def _slow_average(pixels: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -106,6 +114,32 @@ def test_masks_depth_maps_and_columns_are_smaller_too(colmap_scene, tmp_path):
     small = view.at_size((48, 32))
     assert small.depth_reliable and torch.equal(small.target_inverse_depth[0, 5], torch.arange(48) * 2 + 0.5)
     assert torch.equal(small.depth_mask, torch.ones(1, 32, 48))
+
+
+def test_levels_are_of_the_schedule_and_small_views_stay():
+    levels = ((0.0, 4.0), (0.1, 2.0), (0.25, 1.0))
+    assert levels == PYRAMID
+    sizes = Sizes(_schedule(1000), None)
+    factors = [sizes.factor_at(t) for t in range(1, 1001)]
+    assert [factors.index(f) + 1 for f in (4.0, 2.0, 1.0)] == [1, 100, 250] and factors == sorted(factors)[::-1]
+    assert [t for t in range(2, 1001) if sizes.factor_at(t - 1) != sizes.factor_at(t)] == [100, 250]
+    view = argparse.Namespace(image_width=200, image_height=100)
+    assert smaller(view, 4.0) == (64, 32) and smaller(view, 2.0) == (100, 50)
+    assert smaller(argparse.Namespace(image_width=20, image_height=10), 4.0) == (20, 10)
+
+
+def test_views_are_made_once_a_level_and_assigned_pictures_are_left_alone(colmap_scene, tmp_path):
+    scene, _ = _scene(colmap_scene, tmp_path, resolution=1)
+    first, second, third = scene.getTrainCameras()[:3]
+    sizes = Sizes(_schedule(1000), scene.images)
+    third.original_image = torch.zeros(3, 64, 96)
+    small = sizes.view(first, 1)
+    assert small._size == (48, 32) and small is sizes.view(first, 2) and sizes.view(third, 2) is third
+    assert not sizes.needs(first) and sizes.needs(second)
+    assert sizes.view(first, 250) is first and sizes.needs(first)
+    limited, _ = _scene(colmap_scene, tmp_path / "limited", resolution=1, images_to_load=3)
+    sizes, view = Sizes(_schedule(1000), limited.images), limited.getTrainCameras()[0]
+    assert sizes.view(view, 1) is not sizes.view(view, 1) and sizes.needs(view)
 
 
 def _photo(cycles: float, depth: InMemory | None = None) -> Camera:

@@ -1,25 +1,29 @@
 """Training by the clock: it ends when its seconds are over, goes through the whole schedule, and can be repeated."""
 
 import json
+import math
 import random
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+import torch
 from gaussians import options
 from trainings import LEARNT, PART_OPTIONS, before_steps, narrow_scene, train_on
 
 from scene.gaussians import density_rules as rules
+from splatting.features import time_budget
 from splatting.features.time_budget import Sizes
 from splatting.features.time_budget_file import read_schedule, schedule_of, write_schedule
 from splatting.features.time_budget_schedule import Block, Decided, DecidedSchedule, TimeBudget
 from splatting.iteration import Iteration
 from splatting.log import ProgressBar
 from splatting.records.training_log import Stopwatch
-from splatting.registry import strategy_part
+from splatting.registry import strategies, strategy_part
 from splatting.run import Run
-from splatting.schedule import Schedule
+from splatting.schedule import Schedule, longer_steps
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -539,3 +543,62 @@ def test_a_number_of_iterations_goes_through_the_whole_schedule(tmp_path):
     ):
         with pytest.raises(UserError, match=reason):
             schedule_of(options(**{"schedule": "7"} | words), None, 0)
+
+
+@pytest.mark.parametrize("name", ["constant", "growth"])
+def test_half_of_the_schedule_is_done_in_half_of_the_seconds(name):
+    schedule, begun = _fresh(30_000, 20.0), []
+
+    def cost(iteration: int, step: int) -> float:
+        begun.append((step, (begun[-1][1] + COSTS[name](iteration - 1, begun[-1][0])) if begun else 0.0))
+        return COSTS[name](iteration, step)
+
+    _run(schedule, cost)
+    assert next(seconds for step, seconds in begun if step >= 15_000) == pytest.approx(10.0, abs=0.7)
+
+
+def test_the_end_of_a_repeated_schedule_is_known():
+    repeated = DecidedSchedule(Decided(100, [Block(20, 0.0, 0.05, 0.0)], 20, 9.0))
+    assert repeated.known([50, 100]) == [20] and repeated.known([50]) == [] == _fresh(100, 9.0).known([50, 100])
+
+
+@pytest.mark.parametrize("length", [30_000, 7000])
+@pytest.mark.parametrize(
+    ("steps", "factor"),
+    [(3000, math.sqrt(40)), (7000, 2 * math.sqrt(30 / 7)), (15_000, math.sqrt(8)), (30_000, 2.0), (240_000, 1.0)],
+)
+def test_rates_fall_to_a_tenth_at_the_end(length, steps, factor):
+    """Whatever --iterations counts: the rates of a run follow the number of its own."""
+    schedule = DecidedSchedule(_evenly(length, steps))
+    percents = range(steps // 100, steps + 1, steps // 100)
+    factors = [schedule.rate_factor(iteration) for iteration in percents]
+    held = int(0.7 * len(factors))
+    assert factors[:held] == pytest.approx([factor] * held) and factors[-1] == pytest.approx(0.1 * factor)
+    falling = factors[held:]
+    assert falling == sorted(falling, reverse=True) and falling[0] > 0.98 * factor
+    assert schedule.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
+    assert factors == pytest.approx([longer_steps(30_000 / steps, iteration / steps) for iteration in percents])
+
+
+@pytest.mark.parametrize(
+    ("views", "seconds", "device", "strategy"),
+    [(43, 10, "cpu", "budget"), (43, 10, "cuda", "budget"), (43, 11, "cuda", "mcmc"), (60, 90, "cuda", "budget")],
+)
+def test_few_photos_and_much_time_on_a_gpu_take_mcmc(views, seconds, device, strategy):
+    scene = SimpleNamespace(getTrainCameras=lambda: [None] * views)
+    run = SimpleNamespace(scene=scene, device=torch.device(device), parts=[], strategies=strategies())
+    schedule = TimeBudget(Decided(30_000, [], None, seconds))
+    assert schedule.best_strategy(run) == strategy
+
+
+@pytest.mark.parametrize(
+    ("device", "photos", "wanted"), [("cuda", 20, 25), ("cuda", 75, 37.5), ("cuda", 300, 50), ("cpu", 300, 25)]
+)
+def test_many_photos_on_a_gpu_train_more_gaussians(device, photos, wanted):
+    info = SimpleNamespace(has_random_points=False)
+    scene = SimpleNamespace(
+        getTrainCameras=lambda: [None] * photos, training_pixels=lambda: (1e6, 1), images=None, info=info
+    )
+    run = SimpleNamespace(scene=scene, device=torch.device(device), schedule=_fresh(3000, 20.0))
+    time_budget.TimeBudget().begin(run, None)
+    assert run.schedule.an_iteration == wanted
