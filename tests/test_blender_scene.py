@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scipy.spatial.transform import Rotation
 from synthetic import FakeGaussians, edit_json, folder_state, options_of, read
 
 from scene import Scene
@@ -142,20 +141,6 @@ def test_a_scale_of_poses_is_divided_out(blender_scene):
         np.testing.assert_allclose(other.R, one.R, rtol=close, atol=close)
         np.testing.assert_allclose(other.T, one.T, rtol=close, atol=close)
     assert scaled.extent == pytest.approx(plain.extent, rel=1e-14)
-
-
-@pytest.mark.parametrize("digits", [3, 4])
-def test_poses_that_were_rounded_are_taken(blender_scene, digits):
-    oblique = Rotation.from_rotvec([0.3, 0.8, -0.5]).as_matrix()
-    _turned(lambda turn, _: oblique @ turn)(blender_scene)
-    exact = _read(blender_scene).train_cameras
-    _turned(lambda turn, _: turn.round(digits))(blender_scene)
-    poses = json.loads((blender_scene / "transforms_train.json").read_text())["frames"]
-    for frame, camera, one in zip(poses, _read(blender_scene).train_cameras, exact, strict=True):
-        np.testing.assert_allclose(camera.R, one.R, atol=2 * 10.0**-digits)
-        if digits > 3:  # not changed at all
-            pose = np.array(frame["transform_matrix"]) @ np.diag([1.0, -1, -1, 1])
-            np.testing.assert_array_equal(camera.R, np.linalg.inv(pose)[:3, :3].T)
 
 
 def test_real_scene(shared_dir, tmp_path):

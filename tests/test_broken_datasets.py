@@ -77,22 +77,6 @@ def _twice(file: str, number: int, *places: tuple[int, str]) -> Change:
     return _lines(file, lambda lines: [*lines[:number], _replaced(lines[0], places), *lines[more], *lines[number:]])
 
 
-def _same_ids(file: str, length: int, width: int, at: int, each: int) -> Change:
-    """The first two records of a binary file get the same id, of `width` bytes.
-
-    length: of a record without its list, whose count is at `at`, before values of `each` bytes.
-    """
-
-    def change(scene: Path) -> None:
-        path = scene / SPARSE / file
-        content = bytearray(path.read_bytes())
-        second = 8 + length + each * int.from_bytes(content[8 + at : 16 + at], "little")
-        content[second : second + width] = content[8 : 8 + width]
-        path.write_bytes(content)
-
-    return change
-
-
 def _cloud(name: str, properties: str, rows: str, element: str = "vertex 1", kind: str = "ascii") -> Change:
     header = [f"ply\nformat {kind} 1.0\nelement {element}", *(f"property {p}" for p in properties.split(", "))]
     return _written(name, "\n".join([*header, "end_header", rows]) + "\n")
@@ -216,21 +200,13 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
             _word("cameras.txt", (1, "EQUIRECTANGULAR"), (4, "96"), (5, "64"), (6, ""), (7, "")),
             "V03.png is a panorama, which no pinhole image can show; train on it with --lenses native",
         ),
-        (_word("cameras.txt", (1, "EQUIRECTANGULAR"), (6, ""), (7, "")), "camera of Right/V03.png has no usable size"),
-        (_word("cameras.txt", (4, "0")), "camera of Right/V03.png has no usable size or focal length"),
         (_word("images.txt", (5, "nan")), "pose of .*png is not finite"),
         (_word("images.txt", (5, "1e30")), "more than 1e[+]12 from the origin"),
         (_word("images.txt", (8, "77")), r"SCENE/sparse/0/images\.txt has the camera 77"),
         (_word("points3D.txt", (2, "nan")), r"line 1 of SCENE/sparse/0/points3D\.txt .*nan"),
         (_twice("cameras.txt", 1), "^line 1 and line 2 of .*cameras.txt both have the id 1; keep one"),
-        (_twice("images.txt", 4, (9, "other.png")), r"^line 1 and line 5 of .*images\.txt both have the id \d"),
         (_twice("images.txt", 4, (0, "999")), r"^line 1 and line 5 of .*images\.txt both have the name left/v08.png"),
         (_twice("points3D.txt", 3), r"^line 1 and line 4 of .*points3D\.txt both have the id 1;"),
-        (
-            _same_ids("images.bin", 64 + 13 + 8, 4, 64 + 13, 24),
-            r"^photo 1 and photo 2 of .*images\.bin both have the id",
-        ),
-        (_same_ids("points3D.bin", 51, 8, 43, 8), r"^point 1 and point 2 of .*points3D\.bin both have the id"),
         (
             _lines("points3D.txt", lambda lines: [_replaced(line, SMALL) for line in lines]),
             r"^line 1 of .*points3D\.txt has the colour 0.0 1.0 0.25, but COLMAP's colours range from 0 to 255;",
@@ -249,7 +225,6 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_one_photo, "SCENE has too few photos for --eval"),
         (_own(f"{XYZ}, uchar red, uchar green", "0 0 0 1 1"), "points3D.ply has red but no blue"),
         (_own(f"{XYZ}, {RGB.replace('uchar', 'float')}", "0 0 0 256 128 0"), "colours in .*points3D.ply are neither"),
-        (_own(f"{XYZ}, {RGB.replace('uchar', 'int')}", "0 0 0 70000 128 0"), "colours in .*points3D.ply are neither"),
         (_mine("float x", "", element="face 0"), "has no x, y, z; it needs"),
         (_mine(f"{XYZ}, {RGB}", "0 0 0 1 1 1\n0 nan 0 1 1 1", "vertex 2"), r"1 of 2 .* finite \(first: number 1\)"),
         (_mine(f"list uchar {XYZ}, {RGB}", "2 1 1 0 0 1 1 1"), "lists instead of numbers"),
@@ -258,16 +233,13 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
     "blender": [
         (_gone("train/r_2.png"), "1 of 4 photos that .*transforms_train.json lists are missing: SCENE/train/r_2.png"),
         (_cut("transforms_train.json", 30), "SCENE/transforms_train.json is not a camera file .JSONDecodeError"),
-        (_written("transforms_train.json", "[1]"), "transforms_train.json is not a camera file"),
         (_written("transforms_train.json", "[" * 100_000), "transforms_train.json is not a camera file"),
         (_json(lambda content: content.pop("camera_angle_x")), "has neither camera_angle_x nor fl_x"),
         (_with(camera_angle_x=40.0), "camera_angle_x in .*between 0 and pi, got 40.0; .*radians"),
-        (_with(camera_angle_x=10**400), "OverflowError"),
         (_with(cx=1e30), "principal point far outside"),
         (_no_frames, "SCENE/transforms_train.json lists no frames"),
         (_frame(file_path="a" * 5000), "1 of 4 photos"),
         (_lacking("file_path"), r"^frame 2 of SCENE/transforms_train\.json has no file_path"),
-        (_lacking("transform_matrix"), r"frame 2 \(./train/r_1\) of .*has no transform_matrix"),
         (_frame(transform_matrix=[[1, 2], [3, 4]]), r"^frame 1 \(./train/r_0\) of .* must be 4x4 .*got shape"),
         (_frame(transform_matrix=[[0] * 4] * 4), r"^frame 1 \(./train/r_0\) of SCENE/.*Singular matrix"),
         (_pose(3, [1, 2, 3, 4]), "the last row of transform_matrix must be 0 0 0 1"),
@@ -279,9 +251,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
         (_with(camera_model="SPHERICAL"), "camera_model SPHERICAL in .*cannot be used, only PINHOLE"),
         (_with(k1=0.1, k4=0.1), "has k4, k5 or k6 for the camera_model PERSPECTIVE"),
         (_with(fl_x="wide"), "is not a camera file .*could not convert"),
-        (_with(fl_x=[1]), "is not a camera file .*TypeError"),
         (_with(fl_x=0), "camera of images/.* has no usable size or focal length"),
-        (_with(w=0), "no usable size or focal length"),
         (_with(frames=[]), "lists no frames"),
         (_json(lambda content: content.pop("frames")), "is not a camera file .*KeyError: 'frames'"),
     ],
@@ -289,9 +259,7 @@ FAULTS: dict[str, list[tuple[Change, str]]] = {
 # In units of the photo's size these are damaged files, not lenses.
 for name, further in (("PINHOLE", ""), ("OPENCV", " 0.1 0 0 0")):
     for params in (
-        (FOCAL, FOCAL, 45, 1e300),
         (FOCAL, FOCAL, -1e20, 34),
-        (1e300, FOCAL, 45, 34),
         (FOCAL, 5e-324, 45, 34),
     ):
         places = (1, name), (4, " ".join(map(repr, params)) + further), (5, ""), (6, ""), (7, "")
@@ -301,14 +269,9 @@ for name, further in (("PINHOLE", ""), ("OPENCV", " 0.1 0 0 0")):
 # Distortions that fold the photo, or that no lens has.
 for name, further in (
     ("OPENCV", "-9 0 0 0"),
-    ("OPENCV", "1e6 0 0 0"),
-    ("OPENCV", "1e300 -1e300 0 0"),
-    ("OPENCV", "0 0 1e3 0"),
     ("OPENCV", "nan 0 0 0"),
     ("OPENCV_FISHEYE", "-9 0 0 0"),
     ("THIN_PRISM_FISHEYE", "0 0 0 0 0 0 1e3 0"),
-    ("FOV", "1e5"),
-    ("RAD_TAN_THIN_PRISM_FISHEYE", "-90 0 0 0 0 0 0 0 0 0 0 0"),
 ):
     places = (1, name), (4, f"{FOCAL} {FOCAL} 45 34 {further}"), (5, ""), (6, ""), (7, "")
     said = "camera of Right/V03.png " + ("has no usable size" if "nan" in further else "folds its photo or changes")

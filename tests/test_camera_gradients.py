@@ -143,29 +143,6 @@ def test_the_total_of_a_pose_is_the_oracles(antialiasing, device, dtype):
         assert error(one.cpu(), two).largest < (1e-11 if dtype == torch.float64 else 2e-5)
 
 
-def _two_ways(parameters: dict[str, Tensor], camera, **asked) -> list[dict[str, Tensor]]:
-    found = []
-    for fields in ({}, asked):
-        inputs = {name: t.clone().requires_grad_() for name, t in parameters.items()}
-        means2d = torch.zeros_like(inputs["means"]).requires_grad_()
-        out = render(inputs, camera._replace(**fields), means2d, want_absolute_gradient=True)
-        (out.color.square().sum() + out.inverse_depth.sum()).backward()
-        found.append({"color": out.color, "means2d": means2d.grad} | {k: t.grad for k, t in inputs.items()})
-    return found
-
-
-@BOTH_AND_GPU
-def test_other_gradients_keep_their_bytes(device, dtype):
-    parameters, size = few(dtype=dtype)
-    parameters = {name: t.to(device) for name, t in parameters.items()}
-    camera = move_camera(settings(**size, view=VIEW), device)
-    view = camera.viewmatrix.clone().requires_grad_()
-    plain, asked = _two_ways(parameters, camera, viewmatrix=view)
-    assert view.grad.isfinite().all() and view.grad[:, :3].all() and not view.grad[:, 3].any()
-    for name, values in plain.items():
-        assert torch.equal(values, asked[name]), name
-
-
 def test_no_gaussian_is_seen():
     """A camera that looks away, and one of no Gaussians, get zeros."""
     parameters, size = few()

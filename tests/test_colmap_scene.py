@@ -168,25 +168,6 @@ def test_order_of_views_and_numbers(colmap_scene, tmp_path):
     assert {c.uid: c.image_name for c in mixed} == {c.uid: c.image_name for c in kept}
 
 
-def test_loading_a_saved_iteration(colmap_scene, tmp_path):
-    options = options_of(colmap_scene, tmp_path / "out")
-    with pytest.raises(UserError, match="no saved iteration"):
-        Scene(options, FakeGaussians(), load_iteration=-1)
-    fresh = Scene(options, FakeGaussians())
-    fresh.save(7)
-    fresh.save(30)
-    before = folder_state(tmp_path / "out")
-    for asked, loaded in ((-1, 30), (7, 7)):
-        gaussians = FakeGaussians()
-        scene = Scene(options, gaussians, load_iteration=asked)
-        assert scene.loaded_iter == loaded
-        assert gaussians.loaded == str(tmp_path / "out" / "point_cloud" / f"iteration_{loaded}" / "point_cloud.ply")
-    for missing in (0, 8):
-        with pytest.raises(UserError, match=rf"iteration {missing} was never saved .*give one of 7, 30"):
-            Scene(options, FakeGaussians(), load_iteration=missing)
-    assert folder_state(tmp_path / "out") == before
-
-
 def test_a_given_cloud_is_used_and_copied_byte_for_byte(colmap_scene, tmp_path):
     ply = tmp_path / "mine.ply"
     ply.write_text(

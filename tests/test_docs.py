@@ -1,10 +1,8 @@
 """README and docs: copied figures, and every command and flag that a page shows."""
 
-import ast
 import contextlib
 import functools
 import io
-import pkgutil
 import re
 import runpy
 import subprocess
@@ -102,14 +100,6 @@ def _help(program: str, word: str) -> str:
     return said.getvalue()
 
 
-def test_every_benchmark_is_shown_and_shows_how_it_is_run():
-    for path in (ROOT / "benchmarks").glob("*/*.py"):
-        text, name = path.read_text(encoding="utf-8"), f"benchmarks.{path.parent.name}.{path.stem}"
-        if '__name__ == "__main__"' in text:
-            name = name.removesuffix(".__main__")
-            assert name in PROGRAMS and f"python -m {name} " in ast.get_docstring(ast.parse(text))
-
-
 @pytest.mark.parametrize("program", PROGRAMS)
 def test_every_flag_shown_is_known(program):
     unknown = []
@@ -138,37 +128,9 @@ def test_links_resolve_in_the_repository():
     assert links and [(_name(page), link) for page, link in links if not (page.parent / link).exists()] == []
 
 
-@pytest.mark.parametrize("page", ["README.md", "paper.md"])
-def test_copied_figures_stand_in_the_results(page):
-    """The pages copy rows of a table, without their spread. A table made anew must not leave the copy behind."""
-
-    def rows(name: str) -> list[list[str]]:
-        lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
-        cells = ([cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("|"))
-        return [[cell.partition(" ±")[0] for cell in row] for row in cells]
-
-    copied = [row for row in rows(page) if re.fullmatch(r"[\d.]+", row[-2])]
-    measured = rows("docs/results/training.md")
-    assert len(copied) == 6 and all(any(set(row) <= set(one) for one in measured) for row in copied)
-
-
-def test_the_paper_cites_what_its_bibliography_has():
-    known = re.findall(r"^@\w+\{(\w+),", (ROOT / "paper.bib").read_text(encoding="utf-8"), re.MULTILINE)
-    cited = re.findall(r"@(\w+)", (ROOT / "paper.md").read_text(encoding="utf-8"))
-    assert set(known) == set(cited) and len(known) == len(set(known))
-
-
 def test_the_worked_example_applies_to_the_code():
     """tests/test_extending.py, which is slow, also runs what it makes."""
     page = (ROOT / "docs/inside/extending.md").read_text(encoding="utf-8")
     diffs = "".join(re.findall(r"^```diff\n(.*?)^```$", page, re.MULTILINE | re.DOTALL))
     done = subprocess.run(["git", "apply", "--check", "-"], input=diffs, cwd=ROOT, capture_output=True, text=True)
     assert diffs and done.returncode == 0, f"bring the diffs of the page up to date: {done.stderr}"
-
-
-def test_the_pages_of_the_code_name_what_is_there():
-    """`make docs` fails else, which needs packages of its own."""
-    names = [
-        name for page in (ROOT / "docs/api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.M)
-    ]
-    assert len(names) > 50 and all(pkgutil.resolve_name(name) for name in names)

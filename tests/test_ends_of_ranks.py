@@ -7,6 +7,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from forks import fork
 from trainings import narrow_scene
 
 import train
@@ -117,3 +118,24 @@ def test_checkpoints_of_earlier_trainings_do_not_stand(tmp_path):
     (tmp_path / "chkpnt_best.pth").touch()
     assert newest_checkpoint(str(tmp_path)) == str(tmp_path / "chkpnt40.pth")
     assert newest_checkpoint(str(tmp_path), below=40) == str(tmp_path / "chkpnt5.pth")
+
+
+_LEAVE = """
+from pathlib import Path
+import torch.distributed as dist
+from groundwork.ranks.process_group import SeveralRanks
+dist.init_process_group("gloo", store=dist.HashStore(), rank=0, world_size=1)
+ranks = SeveralRanks()
+ranks.itself = ranks
+threads = lambda: [name.read_text() for name in Path("/proc/self/task").glob("*/comm")]
+assert ranks.all_gather_host_ints(7).tolist() == [[7]] and any("gloo" in name for name in threads())
+ranks.leave()
+assert not any("gloo" in name for name in threads())
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="the names of threads are read from /proc")
+def test_no_thread_of_a_group_is_left_behind():
+    """Such a thread would end with Python, whose lock it may wait for, and abort the process."""
+    done = fork(_LEAVE)
+    assert done.status == 0, done.stderr

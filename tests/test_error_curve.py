@@ -5,8 +5,6 @@ import math
 import re
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,10 +17,9 @@ from skimage.metrics import peak_signal_noise_ratio
 
 import train
 from gaussian_renderer.scored_views import mean_scores
-from groundwork.host import clock, memory
 from splatting import objective
 from splatting.records import curve_recorder
-from splatting.records.curve_recorder import CurveDrawer, CurveRecorder, curve_points
+from splatting.records.curve_recorder import CurveDrawer, CurveRecorder
 from splatting.records.error_curve import (
     COLUMNS,
     Row,
@@ -94,9 +91,7 @@ class TestFile:
         [
             *("", "iteration,seconds\n1,2\n", "\xff\x00"),
             *(f"{HEADER}{line}\n" for line in ("x,0.3,,,,,,,,,,", "3,,,,,,,,,,,", "3,0.3,,,,,nan,,,,,")),
-            HEADER + "3,0.3,,,,,,,,,,1.5\n",  # no whole number
             HEADER + "3,0.3,,,,,,,,,\n",  # a line of an older file
-            HEADER + "3,0.3,,,,,,,,,,\n3,0.4,,,,,,,,,,\n",
             HEADER + "3,0.3,,,,,,,,,,\n3,0.3,,,,,,,,,,2\n",  # the whole before its part
         ],
     )
@@ -126,11 +121,8 @@ class TestFile:
     ("iterations", "views", "points", "sets"),
     [
         (200, 4, 12, 1),
-        (300, 8, 12, 1),
         (600, 8, 12, 2),
         (700, 8, 6, 1),
-        (1000, 7, 6, 2),
-        (2000, 8, 11, 2),
         (2000, 40, 12, 2),
     ],
 )
@@ -145,20 +137,6 @@ def test_a_short_training_scores_with_its_end_within_five_percent(tmp_path, iter
     between = [row for row in recorder.rows if row["iteration"] < iterations]
     assert [row["train_psnr"] is None for row in between] == [sets == 1] * points
     assert all(row["subset"] is None for row in between) == (points < 12)
-
-
-class TestPoints:
-    def test_points_are_evenly_spaced_in_log_time(self):
-        for iterations, views, taken, count, ratio, size in (
-            (30_000, 1, None, 32, 2**0.25, 1),
-            (30_000, 1, 30_000, 12, 2**0.5, 1),  # a time budget may leave too few iterations for more
-            (30_000, 25, None, 12, 2**0.5, 25),
-            (12_000, 200, None, 12, 2**0.5, 8),
-            (12_000, 200, 30_000, 12, 2**0.5, 32),
-        ):
-            points, found = curve_points(iterations, [-1, 40_000], 2, views, taken)
-            assert (len(points), found) == (count, size)
-            np.testing.assert_allclose(np.divide(sorted(points)[1:], sorted(points)[:-1]), ratio, rtol=1 / 117)
 
 
 class TestScores:
@@ -179,13 +157,6 @@ class TestScores:
         assert means["psnr"] == pytest.approx(np.mean(psnrs), abs=1e-4)
         assert means["ssim"] == pytest.approx(np.mean(ssims), abs=1e-5)
 
-    def test_equal_images_and_no_images(self):
-        image = torch.full((3, 12, 12), 51 / 255)
-        means = mean_scores([(image, torch.full((3, 12, 12), 51, dtype=torch.uint8), None), (image, image * 0, None)])
-        assert means["psnr"] == pytest.approx(-20 * math.log10(0.2)) and means["l1"] == pytest.approx(0.1)
-        assert mean_scores([(image, image, None)]) == {"l1": 0.0, "ssim": pytest.approx(1.0)}
-        assert mean_scores([]) == {}
-
     def test_masks(self):
         """A mask without a rim gives the scores of views without the rim; SSIM is tested with the loss."""
         generator = torch.Generator().manual_seed(0)
@@ -197,18 +168,6 @@ class TestScores:
         assert means["l1"] == pytest.approx(inside["l1"], rel=1e-5)
         assert means["psnr"] == pytest.approx(inside["psnr"], abs=1e-4)
         assert means["ssim"] != pytest.approx(mean_scores([(image, target, None)])["ssim"], abs=1e-3)
-
-    def test_pictures_and_masks_are_loaded_before_a_scoring_is_timed(self, tmp_path):
-        recorder, seen = _recorder(tmp_path, 2, [1], {"test": ["a"], "train": ["b"]})
-        recorder.add(1, 1.0, 5)
-        assert seen == [("load", ["a", "b"]), ("scores", "a"), ("scores", "b")]
-        recorder.add(2, 2.0, 5)
-        assert seen[3:] == [("scores", "a"), ("scores", "b")]  # loaded once
-        assert recorder.rows[0]["test_psnr"] == recorder.rows[1]["train_psnr"] == 20.0
-        rows = (_row(1, 10.0, peak_memory_mib=1e6),)  # of an earlier part, which took more
-        recorder, _ = _recorder(tmp_path, 2, [1], {"test": ["a"], "train": ["b"]}, rows)
-        recorder.add(2, 2.0, 5)
-        assert recorder.rows[-1]["peak_memory_mib"] == 1e6
 
     def test_between_the_same_part_of_each_set_is_scored_and_stays_a_line_where_all_is(self, tmp_path):
         views = {"test": [10.0 + n for n in range(25)], "train": [50.0 + n for n in range(25)]}
@@ -225,25 +184,6 @@ class TestScores:
         assert {(row["test_psnr"], row["train_psnr"]) for row in rows_on(rows, 1)} == {tuple(scored[:2])}
         assert {(row["test_psnr"], row["train_psnr"]) for row in whole_sets(rows)} == {(22.0, 62.0)}
         assert read_curve(tmp_path / "error_vs_time.csv") == rows
-
-    @pytest.mark.parametrize("taken", [60, 130, 400, 20_000])
-    def test_by_the_clock_points_fit_the_iterations_that_there_will_be(self, tmp_path, taken):
-        """12 points in at most 5 % of the training from 120 iterations on."""
-        recorder, seen = self._by_the_clock(tmp_path, taken, lambda step: taken if step > 1 + taken // 100 else None)
-        between = sum(kind == "scores" for kind, _ in seen) - 12
-        assert 0.5 * between <= 0.05 * taken or taken < 120
-        assert len({row["iteration"] for row in recorder.rows}) >= (12 if taken >= 400 else 10 if taken == 130 else 1)
-
-    @staticmethod
-    def _by_the_clock(folder: Path, taken: int, expected: Callable[[int], float | None], rows: tuple[Row, ...] = ()):
-        """A recorder after `taken` iterations of a schedule of 30,000. expected: how many, as known in an iteration."""
-        views = {"test": [10.0 + n for n in range(6)], "train": [20.0] * 6}
-        recorder, seen = _recorder(folder, 30_000, [], views, rows, steady=False)
-        for step in range(1, taken + 1):
-            span = range(30_000 * (step - 1) // taken + 1, 30_000 * step // taken + 1)
-            if recorder.due(span, 0, step / 10, expected(step)):
-                recorder.add(recorder.point(span), step / 10, 5, step)
-        return recorder, seen
 
 
 class TestPeak:
@@ -342,17 +282,3 @@ class TestTraining:
         monkeypatch.setattr(sys, "executable", "/nowhere/python")
         _train(colmap_scene, tmp_path / "other", iterations=2)
         assert "warning: no error_vs_time.png: no process can be started" in capfd.readouterr().err
-
-
-def test_a_system_that_tells_nothing(monkeypatch):
-    for module in (clock, memory):
-        monkeypatch.setattr(module, "Path", lambda _: Path("/nowhere"))
-    assert 0 < clock.wall_seconds() <= time.perf_counter()
-    assert memory.peak_memory_mib(torch.device("cpu")) is None
-
-
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
-def test_memory_of_a_gpu():
-    held = torch.ones(2**26, dtype=torch.uint8, device="cuda")
-    assert memory.peak_memory_mib(held.device) >= 64

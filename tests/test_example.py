@@ -1,7 +1,6 @@
 """The worked examples of parts (tests/parts/example): each is a file, options and a line, and resumes to the byte."""
 
 import json
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -79,38 +78,3 @@ def test_a_strategy_with_a_value_for_each_gaussian(colmap_scene, tmp_path):
     # Its name is in model.json, so the strategy joins late.
     again = _train(colmap_scene, "-m", tmp_path / "resumed", "--start_checkpoint", checkpoint, *often)
     assert again.status == 0 and _ply(tmp_path / "resumed") == _ply(tmp_path / "two"), again.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not (ROOT / "applications").is_dir(), reason="the rules are about applications, too")
-def test_copies_of_the_examples_keep_the_rules_of_parts(tmp_path):
-    """The copies are made as the guide says: a file, an entry of options and a line each."""
-    for path in (*ROOT.glob("*.py"), ROOT / "pyproject.toml", ROOT / "version.txt"):
-        shutil.copy(path, tmp_path)
-    rooms = ("applications", "arguments", "gaussian_renderer", "groundwork", "lpipsPyTorch", "scene", "splatting")
-    for room in (*rooms, "tests", "utils"):
-        shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("node_modules", "__pycache__"))
-    for name in ("grey", "patient"):
-        shutil.copy(ROOT / "tests/parts/example" / f"{name}.py", tmp_path / "splatting/features")
-    with open(tmp_path / "arguments/features.py", "a", encoding="utf-8") as table:
-        table.write((ROOT / "tests/parts/example/options.py").read_text(encoding="utf-8"))
-    registry = tmp_path / "splatting/registry.py"
-    text = registry.read_text(encoding="utf-8").replace("    SparseDepth,", "    Grey,\n    Patient,\n    SparseDepth,")
-    imports = "".join(f"from splatting.features.{name} import {name.capitalize()}\n" for name in ("grey", "patient"))
-    registry.write_text(text.replace("from splatting.features.mcmc", f"{imports}from splatting.features.mcmc"))
-    rules = "nobody_names and (adc or grey or patient) or hidden1"
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-q",
-        "-n",
-        "0",
-        "-p",
-        "no:cacheprovider",
-        "tests/test_parts.py",
-        "-k",
-        rules,
-    ]
-    done = subprocess.run([*command, "-m", "not slow"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout

@@ -3,13 +3,10 @@
 import pytest
 import torch
 from diff_gaussian_rasterization.fakes import ABSOLUTE_VALUES, MOMENT_VALUES, RAY_VALUES, SPLAT_VALUES
-from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, moved_by_a_word, ops
+from rasterizer_tools import BOTH_AND_GPU, moved_by_a_word, ops
 from torch import Tensor
 
-from gaussian_renderer.over_ranks.bands import Bands
-from gaussian_renderer.over_ranks.exchange import Sent, return_rows, send_splats
 from groundwork.host.read_later import read_later
-from groundwork.ranks.ranks import ALONE, Ranks
 
 LARGE = 20_000  # more than a thread of the CPU takes at once, and no multiple of anything
 
@@ -75,19 +72,6 @@ def test_records_are_counted_and_listed(kind, values, device, dtype):
     assert kind != "some" or len(gaussians) > LARGE / 2
 
 
-@CPU_AND_GPU
-@pytest.mark.parametrize("seen", [0, 1, 2, 3, 4])
-def test_records_are_sent_in_fours_of_which_the_last_is_empty(seen, device):
-    rects = torch.tensor([[0, 0, 1, 1]] * 5, dtype=torch.int32, device=device)
-    tile_counts = (torch.arange(5, device=device) < seen).int()
-    splats, depths = torch.rand(5, SPLAT_VALUES, device=device), torch.rand(5, device=device)
-    arrived, sent = send_splats(ALONE, Bands([0, 1], 16, 0, device), (splats, depths, rects, tile_counts))
-    assert sent.sizes == sent.received == [4 * (seen // 4 + 1)]
-    for one, other in zip(arrived, (splats, depths, rects, tile_counts), strict=True):
-        assert torch.equal(one[:seen], other[:seen]) and not one[seen:].any()
-    assert sent.gaussians.tolist() == [*range(seen), *[5] * (sent.sizes[0] - seen)]
-
-
 def some_counts(kind: str) -> Tensor:
     generator = torch.Generator().manual_seed(5)
     counts = torch.randint(4, (5_000,), generator=generator, dtype=torch.int32)
@@ -135,40 +119,6 @@ def test_runs_are_added_up(kind, values, device, dtype):
     moved = ops.sum_runs(rows, counts, kept, int(kept.sum()), places)
     pieces = again.split(kept.tolist())
     assert torch.equal(moved, torch.cat([again[:0], *(pieces[place] for place in order.tolist())]))
-
-
-class _Both(Ranks):
-    """Two ranks in one: what it sends arrives here. sent: the sizes of what went to each."""
-
-    size = 2
-
-    def __init__(self) -> None:
-        self.sent: list[list[int]] = []
-
-    def send(self, rows: Tensor, sizes: list[int], counts: list[int] | None = None) -> tuple[Tensor, list[int]]:
-        self.sent.append(list(sizes))
-        return rows, list(sizes)
-
-
-@CPU_AND_GPU
-@pytest.mark.parametrize("counts", [[2, 0, 1, 5, 3], [0, 0, 1, 0, 0], [1, 1, 1, 1, 1], [0] * 5])
-def test_sums_come_back_in_even_numbers_and_rows_of_borders_as_they_are(counts, device):
-    """Gaussians 0 and 3 of the first rank's band, 1, 3 and 4 of the other's; number 3 reaches both."""
-    counts = torch.tensor([*counts[:2], 0, 0, *counts[2:], 0], dtype=torch.int32, device=device)
-    rows = torch.randn(int(counts.sum()), 10, generator=torch.Generator().manual_seed(2)).to(device)
-    gaussians = torch.tensor([0, 3, 5, 5, 1, 3, 4, 5], device=device)
-    inside = torch.tensor([True, False, True, True, True, False, True, True], device=device)
-    places = torch.tensor([0, 2, 5, 6, 1, 3, 4, 7], dtype=torch.int32, device=device)
-    ranks, sent = _Both(), Sent(gaussians, [4, 4], [4, 4], places)
-    returned, total = return_rows(ranks, sent, 5, rows, counts, inside)
-    assert ranks.sent[0] == [4, 4] and all(size % 2 == 0 for size in ranks.sent[1])
-    wanted = []
-    for part, whole in zip(rows.split(counts.tolist()), inside.tolist(), strict=True):
-        wanted.append(part.sum(0, keepdim=True)[: len(part)] if whole else part)
-    per_record = torch.tensor([len(part) for part in wanted], dtype=torch.int32, device=device)
-    torch.testing.assert_close(returned, torch.cat([wanted[record] for record in places.argsort().tolist()]))
-    sums = torch.zeros(6, dtype=torch.int32, device=device).index_add_(0, gaussians, per_record)
-    assert torch.equal(total, sums[:5])
 
 
 @pytest.mark.gpu

@@ -1,7 +1,6 @@
 """Figures of error against time: what is drawn, where, and by which marks it is told apart."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,26 +63,6 @@ def test_the_curve_of_a_training(tmp_path, drawn):
     assert not lower.get_legend().get_window_extent().overlaps(lower.xaxis.label.get_window_extent())
     draw_curve(tmp_path / "error_vs_time.png", [rows[2], rows[4]], "a model", {"test": 7, "train": 6})
     assert points(drawn[1].axes[0], "all 7 test views") == [[[1, 15], [4, 14]]] and not hollow(drawn[1].axes[0])
-
-
-def test_the_figures_of_a_scene_can_be_read_at_half_their_size(tmp_path, drawn):
-    """Each panel is a file of its own; its legend covers no point, and names the views."""
-    curves = {
-        "base": curve((0.3, 15.0, 0.7), (2.8, 29.0, 0.945)),
-        "fast start": curve((0.3, 21.0, 0.8), (3.3, 29.5, 0.95)),
-    } | {f"a longer name of set {i}": curve((0.31, 15.0, 0.7), (2.9, 28.5, 0.94)) for i in range(6)}  # fmt: skip
-    files = draw_curves(tmp_path, "attic", runs_of(curves))
-    assert [file.name for file in files] == ["attic_psnr.png", "attic_ssim.png"] and all(map(Path.is_file, files))
-    for figure in drawn:
-        (axes,), (legend,) = figure.axes, figure.legends
-        assert not legend.get_window_extent().overlaps(axes.get_window_extent())
-        assert all(figure.bbox.contains(*corner) for corner in legend.get_window_extent().get_points())
-        said = legend.get_title().get_text()
-        assert said == "all 7 test views"
-        inches = figure.get_figwidth()
-        letters = 358 / inches / 72 * min(text.get_fontsize() for text in legend.get_texts())
-        assert letters > 8.5  # pixels where the window is 390 wide
-    assert draw_curves(tmp_path, "attic", runs_of({"base": []})) == []
 
 
 def test_lines_are_of_the_views_on_which_all_runs_compare(tmp_path, drawn):

@@ -18,8 +18,8 @@ from waiting import wait_for
 
 import train
 from arguments import add_to_model_json, read_model_json, write_cfg_args
-from groundwork.files.folders import locked, remove_temporary_files
-from splatting.folder import check_folder, continue_records, folder_of, own_folder, records_kept
+from groundwork.files.folders import remove_temporary_files
+from splatting.folder import check_folder, continue_records, own_folder, records_kept
 from splatting.records.error_curve import COLUMNS, read_curve, write_curve
 from utils.system_utils import UserError, atomic_write
 
@@ -74,31 +74,6 @@ def test_iterations_that_stay_are_warned_of(colmap_scene, tmp_path, capfd):
     assert "keeps iteration 4, 5, 30000 of" in warning
 
 
-@pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5/point_cloud.ply"])
-def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
-    """Write a trained model and a cfg_args that names another scene."""
-
-    def check(source: Path, checkpoint: Path | None = None) -> None:
-        options = MODEL | {"source_path": str(source), "model_path": str(tmp_path)}
-        check_folder(argparse.Namespace(**options), [5], checkpoint and str(checkpoint), 5 if checkpoint else 0)
-
-    scene, other = tmp_path / "scene", tmp_path / "other"
-    scene.mkdir()
-    write_cfg_args(tmp_path, argparse.Namespace(**MODEL | {"source_path": str(scene)}))
-    check(other)
-    (tmp_path / trained).parent.mkdir(parents=True, exist_ok=True)
-    (tmp_path / trained).touch()
-    with pytest.raises(UserError, match=f"holds a model of another scene, {scene}"):
-        check(other)
-    check(scene / ".." / "scene")
-    # Resuming in the same folder is report_changes' to judge.
-    check(other, tmp_path / "chkpnt5.pth")
-    scene.rename(tmp_path / "moved")
-    check(tmp_path / "moved")
-    (tmp_path / "cfg_args").write_text("of another program")
-    check(other)
-
-
 def test_a_longer_model_keeps_the_options_that_it_was_trained_with(colmap_scene, tmp_path):
     out = tmp_path / "out"
     _train(colmap_scene, out, "--eval", "--checkpoint_iterations", 2, iterations=4)
@@ -113,11 +88,22 @@ def test_a_longer_model_keeps_the_options_that_it_was_trained_with(colmap_scene,
 # From a checkpoint elsewhere
 
 
+@pytest.fixture(scope="module")
+def _whole_master(_colmap_master, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "stdout", sys.stdout)  # training stamps it
+        words = "--eval", "--test_iterations", 10, 30, "--checkpoint_iterations", 20
+        _train(_colmap_master, out, *words, iterations=40)
+    return out
+
+
 @pytest.fixture
-def whole(colmap_scene, tmp_path) -> Path:
-    """A model folder with a curve, and a checkpoint at 20 of 40."""
-    out = tmp_path / "whole"
-    _train(colmap_scene, out, "--eval", "--test_iterations", 10, 30, "--checkpoint_iterations", 20, iterations=40)
+def whole(_whole_master, _colmap_master, colmap_scene, tmp_path) -> Path:
+    """A model folder with a curve, and a checkpoint at 20 of 40, as of a training on colmap_scene."""
+    out = Path(shutil.copytree(_whole_master, tmp_path / "whole"))
+    options = (out / "cfg_args").read_text()
+    (out / "cfg_args").write_text(options.replace(str(_colmap_master), str(colmap_scene)))
     return out
 
 
@@ -255,22 +241,6 @@ def test_every_ending_releases_the_folder(tmp_path, error):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_lock_whose_file_was_replaced_is_taken_anew(tmp_path, monkeypatch):
-    """Its owner removes the file at its end, which may be just after we have opened it."""
-    real, removed = os.path.samestat, []
-
-    def remove_once(*stats: os.stat_result) -> bool:
-        if not removed:
-            removed.append(True)
-            (tmp_path / ".x.lock").unlink()
-            return False
-        return real(*stats)
-
-    monkeypatch.setattr("os.path.samestat", remove_once)
-    with locked(tmp_path, "x.py", "another x.py (process {process})", "-m"):
-        assert removed and (tmp_path / ".x.lock").read_text() == f"{os.getpid()}\n"
-
-
 def test_temporary_files_of_dead_processes_are_removed(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
@@ -326,7 +296,26 @@ def test_records_stay_with_the_model_that_is_saved(tmp_path, saves):
     assert (tmp_path / "cfg_args").read_text() == ("new" if saves else "old")
 
 
-def test_a_checkpoint_is_resumed_in_its_folder(tmp_path):
-    assert folder_of(None) is None and folder_of(str(tmp_path / "chkpnt7.pth")) is None
-    (tmp_path / "cfg_args").touch()
-    assert folder_of(str(tmp_path / "chkpnt7.pth")) == str(tmp_path)
+@pytest.mark.parametrize("trained", ["chkpnt5.pth", "point_cloud/iteration_5/point_cloud.ply"])
+def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
+    """Write a trained model and a cfg_args that names another scene."""
+
+    def check(source: Path, checkpoint: Path | None = None) -> None:
+        options = MODEL | {"source_path": str(source), "model_path": str(tmp_path)}
+        check_folder(argparse.Namespace(**options), [5], checkpoint and str(checkpoint), 5 if checkpoint else 0)
+
+    scene, other = tmp_path / "scene", tmp_path / "other"
+    scene.mkdir()
+    write_cfg_args(tmp_path, argparse.Namespace(**MODEL | {"source_path": str(scene)}))
+    check(other)
+    (tmp_path / trained).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / trained).touch()
+    with pytest.raises(UserError, match=f"holds a model of another scene, {scene}"):
+        check(other)
+    check(scene / ".." / "scene")
+    # Resuming in the same folder is report_changes' to judge.
+    check(other, tmp_path / "chkpnt5.pth")
+    scene.rename(tmp_path / "moved")
+    check(tmp_path / "moved")
+    (tmp_path / "cfg_args").write_text("of another program")
+    check(other)

@@ -50,14 +50,7 @@ def names(cameras: list[CameraInfo], rule: str) -> list[str]:
 
 def test_a_sector_holds_all_cameras_between_two_angles_in_any_frame_of_the_world():
     degrees = [15.0 * i for i in range(24)]
-    expected = [
-        "0_00",
-        "0_01",
-        "0_02",
-        "1_00",
-        "1_01",
-        "1_02",
-    ]  # counter-clockwise from 1_00, in the middle of 48 names
+    expected = [f"{level}_0{number}" for level in (0, 1) for number in range(3)]  # counter-clockwise from 1_00
     for frame in (None, *Rotation.random(5, random_state=0)):
         assert names(ring(degrees, frame), "sector") == expected
     clockwise = [-angle for angle in degrees]

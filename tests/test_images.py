@@ -26,19 +26,13 @@ from utils.system_utils import UserError
     [
         ((1601, 901), 1, 1, (1601, 901)),
         ((1601, 901), 2, 1, (800, 450)),  # 800.5 and 450.5 round to even
-        ((1603, 903), 2, 1, (802, 452)),  # 801.5 and 451.5 as well
-        ((1601, 901), 4, 1, (400, 225)),
         ((1601, 901), 8, 1, (200, 113)),
         ((1602, 901), -1, 1, (1600, 899)),  # 899.9 is cut off
         ((1601, 901), -1, 1, (1599, 900)),  # the reference's division: 1601 / (1601 / 1600) is just below 1600
-        ((1600, 901), -1, 1, (1600, 901)),
         ((900, 4000), -1, 1, (900, 4000)),  # only the width counts
         ((1601, 901), 1000, 1, (1000, 562)),  # 562.8 is cut off
         ((500, 333), 1000, 1, (1000, 666)),  # a width can enlarge
-        ((501, 333), 3, 1, (3, 1)),
         ((3, 3), 8, 1, (1, 1)),  # never without pixels
-        ((1601, 901), 2, 2.0, (400, 225)),
-        ((1000, 500), -1, 2.0, (500, 250)),
         ((1000, 500), 400, 2.0, (200, 100)),
     ],
 )
@@ -46,18 +40,19 @@ def test_training_size(file, r, scale, size):
     assert training_size(*file, r, scale) == size
 
 
-@pytest.mark.parametrize("r", [16385, 100_000_000, 10**400], ids=["next", "huge", "beyond float"])
-def test_absurd_widths_are_refused(r):
-    with pytest.raises(UserError, match=r"-r\) 1\d+ is too wide; give at most 16384"):
-        training_size(48, 32, r)
-
-
-def test_absurd_heights_are_refused():
-    assert training_size(10, 20, 8192) == (8192, 16384)
-    with pytest.raises(UserError, match=r"10 x 30 pixels would train at 8192 x 24576 with --resolution \(-r\) 8192"):
-        training_size(10, 30, 8192)
-    with pytest.raises(UserError, match="would train at 100 x 20000"):
-        training_size(100, 20_000, -1)
+@pytest.mark.parametrize(
+    ("photo", "r", "said"),
+    [
+        ((48, 32), 16385, r"-r\) 16385 is too wide; give at most 16384"),
+        ((48, 32), 10**400, r"-r\) 10+ is too wide; give at most 16384"),
+        ((10, 30), 8192, r"10 x 30 pixels would train at 8192 x 24576 with --resolution \(-r\) 8192"),
+        ((100, 20_000), -1, "would train at 100 x 20000"),
+    ],
+    ids=lambda value: str(value)[:30],
+)
+def test_absurd_sizes_are_refused(photo, r, said):
+    with pytest.raises(UserError, match=said):
+        training_size(*photo, r)
 
 
 def _noise(shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
@@ -96,13 +91,6 @@ def test_alpha_is_copied_at_full_size_and_weighs_colours_when_shrunk(tmp_path):
     assert np.abs(small[3].numpy() - alpha).max() <= 1
 
 
-def test_an_alpha_that_hides_nothing_is_dropped(tmp_path):
-    pixels = _noise((8, 8, 4))
-    pixels[..., 3] = 255
-    Image.fromarray(pixels).save(tmp_path / "a.png")
-    assert decode(tmp_path / "a.png", (8, 8)).shape == (3, 8, 8)
-
-
 def test_grey_palette_cmyk_and_16_bit_become_rgb(tmp_path):
     grey = _noise((6, 5))
     Image.fromarray(grey).save(tmp_path / "l.png")
@@ -120,15 +108,6 @@ def test_grey_palette_cmyk_and_16_bit_become_rgb(tmp_path):
     assert torch.equal(decode(tmp_path / "c.tif", (5, 6)), _chw(rgb.convert("CMYK").convert("RGB")))
     Image.fromarray(np.dstack([grey, grey])).save(tmp_path / "la.png")
     assert torch.equal(decode(tmp_path / "la.png", (5, 6))[3], torch.from_numpy(grey))
-
-
-def test_exif_orientation_is_ignored(tmp_path):
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    image = Image.fromarray(_noise((10, 20, 3)))
-    image.save(tmp_path / "a.png", exif=exif)
-    assert picture_size(tmp_path / "a.png") == (20, 10)
-    assert torch.equal(decode(tmp_path / "a.png", (20, 10)), _chw(image))
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg"])
@@ -290,23 +269,6 @@ def test_code_points_of_heic_and_avif_are_followed(tmp_path, capsys, kind):
     )
 
 
-@pytest.mark.parametrize("orientation", [1, 6])
-def test_photos_for_colmap_are_converted_once(tmp_path, orientation):
-    layout = Layout(tmp_path)
-    layout.input.mkdir()
-    Image.fromarray(COLORS).save(layout.input / "a.png", exif=_exif(65535, "R03"))
-    smooth = Image.fromarray(COLORS[:6, :8] // 3 + 80).resize((64, 48), Image.Resampling.BICUBIC)
-    smooth.save(layout.input / "b.jpg", quality=95, subsampling=0, exif=_exif(65535, "R03", orientation))
-    prepare_images(layout, ["a.png", "b.jpg"], None)
-    upright = np.asarray(smooth) if orientation == 1 else np.rot90(np.asarray(smooth), -1)
-    for name, pixels in (("a.png", COLORS), ("b.jpg", upright)):
-        with Image.open(layout.prepared / name) as image:
-            image.info.pop("icc_profile")  # which not every program keeps
-            image.save(tmp_path / f"again.{name[-3:]}", exif=image.getexif(), quality=100, subsampling=0)
-        found = decode(tmp_path / f"again.{name[-3:]}", pixels.shape[1::-1]).permute(1, 2, 0).numpy()
-        assert np.abs(found - 255 * to_srgb(pixels / 255, "Adobe RGB")).mean() < 2, name
-
-
 def test_there_is_one_limit_of_pixels(tmp_path):
     Image.new("1", (20_000, 10_000)).save(tmp_path / "a.png")
     assert picture_size(tmp_path / "a.png") == (20_000, 10_000)
@@ -349,3 +311,19 @@ def test_photos_that_colmap_undistorts_where_they_lie_keep_their_profile(colmap_
             written = out / "images" / path.relative_to(colmap_scene / "images")
             assert (decode(written, size).int() - decode(path, size).int()).abs().float().mean() < 2, native
     assert pycolmap.Reconstruction(str(out / "sparse")).num_reg_images() == len(photos)
+
+
+def test_an_alpha_that_hides_nothing_is_dropped(tmp_path):
+    pixels = _noise((8, 8, 4))
+    pixels[..., 3] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert decode(tmp_path / "a.png", (8, 8)).shape == (3, 8, 8)
+
+
+def test_exif_orientation_is_ignored(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    image = Image.fromarray(_noise((10, 20, 3)))
+    image.save(tmp_path / "a.png", exif=exif)
+    assert picture_size(tmp_path / "a.png") == (20, 10)
+    assert torch.equal(decode(tmp_path / "a.png", (20, 10)), _chw(image))

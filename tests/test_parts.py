@@ -1,11 +1,7 @@
-"""Rules of parts (splatting/part.py): nobody names one outside of its files, and each can be deleted."""
+"""Rules of parts (splatting/part.py): each can be deleted, and two do not fill the same slot."""
 
-import ast
-import re
 import subprocess
 import sys
-from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,36 +15,7 @@ from splatting.run import overrides
 from utils.system_utils import UserError
 
 ROOT = Path(__file__).resolve().parents[1]
-FOLDER = ROOT / "splatting" / "features"
 ROOMS = ("applications", "arguments", "gaussian_renderer", "groundwork", "scene", "splatting", "utils")
-NAMESPACES = ("args", "opt", "options", "dataset", "given", "launch", "pipe")  # what options are read from
-EVALUATION = "applications/evaluation/command.py"
-KNOWN = {  # words in files that are options of a part, and mean something else there or have to stay
-    ("time_budget", "applications/nerfbaselines/spec.py"),  # a set of options, as a user gives it
-    ("refine_poses", "scene/checks/fit.py"),  # remedies
-    ("schedule", "splatting/checks.py"),
-    ("no_curve", "applications/nerfbaselines/method.py"),
-    ("no_curve", "applications/doctor/advice.py"),  # of a short training
-    ("schedule", "scene/gaussian_model.py"),  # that of exposures' learning rate
-    ("schedule", "scene/gaussians/reference_names.py"),
-    *((option, "scene/dataset_readers.py") for option in ("depths", "train_test_exp")),  # what the reference's take
-    ("train_test_exp", "scene/cameras.py"),
-    *((f"exposure_lr_{end}", "scene/gaussians/exposure.py") for end in ("init", "final", "delay_steps", "delay_mult")),
-    *((f"exposure_lr_{end}", EVALUATION) for end in ("init", "final", "delay_steps", "delay_mult")),  # commands
-    ("train_test_exp", EVALUATION),
-    ("viewer", "applications/evaluation/configs.py"),  # nobody would close its page
-    ("viewer", "applications/export/vendor.py"),  # a folder
-    ("port", "applications/viewer/command.py"),
-    ("viewer", "view.py"),  # the application
-    *((option, "applications/viewer/training_page.py") for option in ("viewer", "paused")),  # the page that it opens
-    *((option, "gaussian_renderer/network_gui.py") for option in ("port", "disable_viewer", "viewer")),  # its sentence
-    *(
-        (option, f"applications/{of}.py")  # of own trainings
-        for option in ("disable_viewer", "no_last_checkpoint")
-        for of in ("evaluation/stages", "doctor/advice")
-    ),
-    ("disable_viewer", "applications/nerfbaselines/method.py"),
-}
 CLASSES = {part.name: part for part in PARTS}
 NAMES = [*CLASSES]
 COMMANDS = ("train", "render", "metrics", "full_eval", "convert", "doctor", "export", "view")
@@ -58,54 +25,9 @@ def _options(name: str) -> set[str]:
     return {*FEATURES[name].by_name} if name in FEATURES else set()
 
 
-def _own(name: str) -> list[Path]:
-    return [FOLDER / f"{name}.py", *FOLDER.glob(f"{name}_*.py")]
-
-
 def _heirs(name: str) -> list[str]:
     """The parts that inherit from a part, as strategies may."""
     return [other for other in NAMES if other != name and issubclass(CLASSES[other], CLASSES[name])]
-
-
-def _files(name: str) -> Iterator[Path]:
-    """All Python files of the project that may not know a part: all but its own, its heirs' and the two tables."""
-    found = [*(path for room in ROOMS for path in (ROOT / room).rglob("*.py") if "tests" not in path.parts)]
-    found += [ROOT / f"{c}.py" for c in COMMANDS]
-    places = [ROOT / "splatting" / "registry.py", ROOT / "arguments" / "features.py"]
-    may = [*places, *(path for one in (name, *_heirs(name)) for path in _own(one))]
-    yield from (path for path in found if path not in may)
-
-
-@cache
-def _nodes(path: Path) -> list[ast.AST]:
-    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
-
-
-def _names_of(name: str, path: Path) -> Iterator[str]:
-    """Lines of a file that import a part, or say the name of one of its options."""
-    file = path.relative_to(ROOT).as_posix()
-    options = {option for option in _options(name) if (option, file) not in KNOWN} or {"no option"}
-    called = [node.func for node in _nodes(path) if isinstance(node, ast.Call)]
-    typed = re.compile(rf"--({'|'.join(map(re.escape, sorted(options)))})\b")
-    for node in _nodes(path):
-        if isinstance(node, ast.ImportFrom):
-            module = re.compile(rf"splatting\.features\.{name}(_\w+)?(\.|$)")
-            found = any(module.match(f"{node.module}.{alias.name}") for alias in node.names)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            found = node.value in options or typed.search(node.value)
-        elif isinstance(node, ast.Attribute):
-            of = getattr(node.value, "attr", getattr(node.value, "id", ""))
-            found = node.attr in options and of.strip("_") in NAMESPACES and node not in called
-        else:
-            continue
-        if found:
-            said = getattr(node, "value", "") if isinstance(node, ast.Constant) else getattr(node, "attr", "an import")
-            yield f"{file}:{node.lineno} says {said!r}; nobody names {name} outside of its files"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_nobody_names_a_part_outside_of_its_files(name):
-    assert [line for path in _files(name) for line in _names_of(name, path)] == []
 
 
 def test_options_import_nothing_heavy_and_no_part():

@@ -1,24 +1,17 @@
-"""train.py's process: what it imports and begins early, the seconds that it notes, its clock and its threads."""
+"""train.py's process: what it imports, the seconds that it notes, its clock and its threads."""
 
 import json
 import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
-import torch
-from waiting import wait_for
 
 import train
-from groundwork.host import clock, machine, start
-from scene import Scene
-from scene.gaussians.adam import undecorated
-from splatting.records.training_log import Stopwatch
+from groundwork.host import machine
 
 ROOT = Path(__file__).parents[1]
 UNUSED = ("torch._dynamo", "torch._inductor", "torch.onnx", "matplotlib")
@@ -31,20 +24,6 @@ before = set(sys.modules)
 import train
 train.main(sys.argv[2:])
 print("loaded:", *sorted(set(sys.argv[1].split(",")) & (set(sys.modules) - before)), file=sys.__stdout__)
-"""
-
-
-TEAMS = """
-import os, sys, threading, time
-os.sched_setaffinity(0, list(os.sched_getaffinity(0))[:2])
-import torch
-import gaussian_renderer
-names = [thread.name for thread in threading.enumerate()]
-torch.zeros(1 << 20).mul_(2)
-end = time.monotonic() + 20
-while len(os.listdir("/proc/self/task")) < 2 + 2 * names.count("idle OpenMP team") and time.monotonic() < end:
-    time.sleep(0.01)
-print(names.count("idle OpenMP team"), len(os.listdir("/proc/self/task")) > 3)
 """
 
 
@@ -65,36 +44,12 @@ def _loaded(scene: Path, out: Path, *more: str) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(sys.platform != "linux", reason="is of GNU's OpenMP")
-@pytest.mark.parametrize(("more", "wanted"), [({}, "1 True"), ({"GOMP_SPINCOUNT": "5"}, "0 False")])
-def test_a_program_that_imports_torch_first_has_more_threads_than_cores_so_that_none_spins_for_long(more, wanted):
-    if len(os.sched_getaffinity(0)) < 2:
-        pytest.skip("has one core, on which torch's threads do not wait for each other")
-    names = {"OMP_NUM_THREADS", "GOMP_SPINCOUNT", "OMP_WAIT_POLICY"}
-    environment = {name: value for name, value in os.environ.items() if name not in names} | more
-    done = subprocess.run([sys.executable, "-c", TEAMS], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert done.stdout.strip() == wanted, done.stderr
-
-
-@pytest.mark.slow
 def test_a_training_imports_nothing_that_it_does_not_use(blender_scene, tmp_path):
     """A checkpoint takes the optimiser's state. Another process draws the curve."""
     assert _loaded(blender_scene, tmp_path, "--eval", "--checkpoint_iterations", "6") == []
     assert (tmp_path / "error_vs_time.png").is_file()
     resumed = ["--start_checkpoint", str(tmp_path / "chkpnt6.pth"), "--optimizer_type", "sparse_adam"]
     assert _loaded(blender_scene, tmp_path, "--eval", "--no_curve", *resumed) == []
-
-
-def _decorated(name: str) -> bool:
-    return undecorated(getattr(torch.optim.Adam, name)) is not getattr(torch.optim.Adam, name)
-
-
-def test_methods_keep_torchs_decorator_once_its_compiler_is_there(monkeypatch):
-    monkeypatch.delitem(sys.modules, "torch._dynamo", raising=False)
-    assert _decorated("add_param_group") and _decorated("state_dict") and _decorated("load_state_dict")
-    assert not _decorated("step")
-    monkeypatch.setitem(sys.modules, "torch._dynamo", torch)
-    assert not _decorated("add_param_group")
 
 
 def test_the_last_record_says_where_the_time_went(colmap_scene, tmp_path):
@@ -108,54 +63,6 @@ def test_the_last_record_says_where_the_time_went(colmap_scene, tmp_path):
     resumed = ["--start_checkpoint", tmp_path / "out" / "chkpnt2.pth"]
     record = _train(colmap_scene, tmp_path / "out", "--eval", "--test_iterations", -1, *resumed)
     assert record["training_seconds"] < record["seconds"]  # the former are of this process alone
-
-
-def test_pictures_are_decoded_while_the_model_is_made(colmap_scene, tmp_path, monkeypatch):
-    kept = []
-    plain = Scene.create_gaussians
-
-    def create(scene: Scene) -> None:
-        kept.append((len(scene.images), scene.images.ahead))
-        plain(scene)
-
-    monkeypatch.setattr(Scene, "create_gaussians", create)
-    _train(colmap_scene, tmp_path / "out", iterations=2)
-    assert kept == [(2, kept[0][1])] and kept[0][1] >= 2  # as many as there are iterations
-
-
-@pytest.mark.parametrize(
-    ("initialised", "expected"), [(0, ["init", "device 0", "context"]), (100, ["init"]), (None, [])]
-)
-def test_the_gpus_context_is_made_in_a_thread(monkeypatch, initialised, expected):
-    """initialised: the driver's answer; None: there is no driver."""
-    calls = []
-
-    def load(name: str) -> SimpleNamespace:
-        assert name == "libcuda.so.1" and threading.current_thread().name == "cuda start"
-        if initialised is None:
-            raise OSError("no such library")
-        return SimpleNamespace(
-            cuInit=lambda flags: calls.append("init") or initialised,
-            cuDeviceGet=lambda device, number: calls.append(f"device {number}") or 0,
-            cuDevicePrimaryCtxRetain=lambda context, device: calls.append("context") or 0,
-        )
-
-    monkeypatch.setattr(start.ctypes, "CDLL", load)
-    monkeypatch.setattr(start, "_computes_on_a_gpu", lambda: True)
-    thread = start.begin_cuda()
-    thread.join()
-    assert calls == expected
-    assert not thread.daemon  # the driver must not be left in the middle of it
-
-
-def test_what_was_built_with_cuda_is_known_before_torch_is_there(tmp_path):
-    """In a fresh process, as the extension is found without being imported."""
-    code = "import sys\nfrom groundwork.host import start\n"
-    code += "print(start._computes_on_a_gpu(), 'torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    from diff_gaussian_rasterization import has_cuda_kernels
-
-    assert done.stdout.split() == [str(has_cuda_kernels()), "False"]
 
 
 # The clock that stands still while its process is stopped, and only then
@@ -195,16 +102,6 @@ def test_seconds_of_a_stopped_process_do_not_count():
     assert wall > 3.0 and counted < wall - 2.5
 
 
-def test_the_thread_of_the_clock_ends_with_its_stopwatch():
-    before = threading.enumerate()
-    watch = Stopwatch()
-    (thread,) = set(threading.enumerate()).difference(before)
-    time.sleep(2 * clock._TICK)
-    assert thread.is_alive()
-    del watch
-    wait_for(lambda: not thread.is_alive())
-
-
 @pytest.mark.slow
 def test_seconds_of_work_count_also_where_no_other_thread_may_look_at_the_clock():
     counted, wall = _counted("hold the lock")
@@ -229,13 +126,6 @@ def made(monkeypatch, tmp_path):
             (tmp_path / group.replace("_", "/") / "cpu.max").write_text(limit)
 
     return make
-
-
-def test_affinity(made):
-    made(2)
-    assert machine.cores() == machine.threads() == 2
-    made(64)
-    assert machine.cores() == 64 and machine.threads() == machine.MOST_THREADS and machine.threads(5) == 5
 
 
 @pytest.mark.parametrize(

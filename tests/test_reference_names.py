@@ -3,7 +3,6 @@
 import argparse
 import ast
 import inspect
-import re
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +10,6 @@ from typing import NamedTuple
 import pytest
 
 CONTRACT = Path(__file__).with_name("reference_names.txt")
-PAGE = Path(__file__).parents[1] / "docs" / "inside" / "reference_names.md"
 SHORT = {
     "GaussianModel": "scene.gaussian_model.GaussianModel",
     "Scene": "scene.Scene",
@@ -95,10 +93,3 @@ def test_a_name_of_the_reference_is_here(row, instances):
     for cell in {row.release2023, row.release2024} - {ABSENT, VALUE}:
         method = first in SHORT or row.name.split(".")[-2][0].isupper()
         _bind(inspect.signature(_resolve(row.name)), cell, method)
-
-
-def test_the_page_lists_the_names_of_the_contract():
-    lists = re.findall(r"^- `([\w.]+)`: ((?:`\w+`†?,?\s+)*`\w+`†?)\.$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
-    names = [(f"{home}.{name}", late) for home, group in lists for name, late in re.findall(r"`(\w+)`(†?)", group)]
-    assert sorted(names) == sorted((row.name, "†" * (row.release2023 == ABSENT)) for row in ROWS)
-    assert len(ROWS) > 150

@@ -148,13 +148,10 @@ def _before(background: int, size: int = 16) -> list[np.ndarray]:
             "of each photo, at the top and left and right, is",
         ),
         (_sharing(ROWS >= 40, TEXTURE), "17% of each photo, at the bottom, is"),
-        (_sharing((ROWS < 6) & (COLUMNS > 50), 200), "2% of each photo, at the top right, is"),
-        (_sharing((np.abs(ROWS - 24) > 14) | (COLUMNS < 8), TEXTURE), "at the top and bottom and left, is"),
         ([np.where(photo == 7, TEXTURE, photo) for photo in _before(7)], "is the same"),  # a turntable
         (_sharing(ROWS >= 40, TEXTURE)[:4], ""),  # few photos
         (_sharing(ROWS >= 40, TEXTURE)[:2] * 6, ""),  # bursts
         (_before(255), ""),
-        (_before(0), ""),
         (_sharing(ROWS < 0, 0), ""),
         ([np.dstack([photo, np.uint8(255 * ~CORNERS)]) for photo in _sharing(CORNERS, TEXTURE)], ""),  # transparent
     ],
@@ -235,17 +232,8 @@ def test_blurred_photos_are_named_whatever_they_show(sound, tmp_path):
         views.append(replace(view, image_path=path, image_name=path.name))
     info = read(sound)._replace(train_cameras=views)
     (found,) = check_blur(info, 100)
-    text = "4 of the {} photos that were checked look blurred (1.png, 3.png, 5.png, 7.png)"
-    assert found.text == text.format(8)
+    assert found.text == "4 of the 8 photos that were checked look blurred (1.png, 3.png, 5.png, 7.png)"
     assert [*check_blur(info._replace(train_cameras=views[::2]), 100)] == [*check_blur(_with_photos(COLORS), 9)] == []
-    black = [replace(views[0], image_path=tmp_path / "black.png", image_name=f"black{n}") for n in range(8)]
-    Image.new("RGB", (64, 48)).save(tmp_path / "black.png")
-    assert [*check_blur(info._replace(train_cameras=[*views[::2], *black]), 100)] == []
-    for view in views:
-        grey = np.asarray(Image.open(view.image_path).convert("L")).astype(np.uint16) * 257
-        Image.fromarray(grey).save(view.image_path)
-    (found,) = check_blur(info._replace(train_cameras=[*views, *black]), 100)
-    assert found.text == text.format(16)
 
 
 def test_sound_photos_are_passed():
@@ -431,20 +419,6 @@ def test_photos_that_are_there_twice(sound, tmp_path):
     assert "all 17 photos are the same picture" in said(info._replace(train_cameras=same))
 
 
-def test_photos_that_differ_between_what_is_compared_first_are_two(sound, tmp_path):
-    """Photos without compression of a thing that moves a little share much."""
-    views = []
-    for number, view in enumerate(read(sound).train_cameras[:2]):
-        content = bytearray(4 << 20)
-        content[1 << 20] = number
-        path = tmp_path / f"{number}.bmp"
-        path.write_bytes(content)
-        views.append(replace(view, image_path=path))
-    assert [*_same_photos(views)] == [[0], [1]]
-    views[1].image_path.write_bytes(views[0].image_path.read_bytes())
-    assert [*_same_photos(views)] == [[0, 1]]
-
-
 SCENES = (
     *("bonsai_full", "bonsai_small", "fox_full", "fox_raw", "fox_tiny", "monstree_mixed", "monstree_raw"),
     *("nerf_lego200_tiny", "nerf_lego400", "tt_train"),
@@ -496,3 +470,17 @@ def test_records_of_other_readers_are_judged(sound):
     plain = [argparse.Namespace(**{name: getattr(view, name) for name in names}) for view in info.train_cameras]
     plain[0].FovX = 3.1
     assert "odd opening angles of 1 camera (" in said(info._replace(train_cameras=plain))
+
+
+def test_photos_that_differ_between_what_is_compared_first_are_two(sound, tmp_path):
+    """Photos without compression of a thing that moves a little share much."""
+    views = []
+    for number, view in enumerate(read(sound).train_cameras[:2]):
+        content = bytearray(4 << 20)
+        content[1 << 20] = number
+        path = tmp_path / f"{number}.bmp"
+        path.write_bytes(content)
+        views.append(replace(view, image_path=path))
+    assert [*_same_photos(views)] == [[0], [1]]
+    views[1].image_path.write_bytes(views[0].image_path.read_bytes())
+    assert [*_same_photos(views)] == [[0, 1]]

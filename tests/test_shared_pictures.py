@@ -29,8 +29,7 @@ TRAININGS = {
     "masks": ("--masks", "masks", "-d", "depths", "--eval"),
     "alpha": ("--masks", "masks", "--mask_meaning", "transparent", "--random_background"),
     "limit": ("--masks", "masks", "-d", "depths", "--images_to_load", 4),
-    "smaller": ("--masks", "masks", "-d", "depths", *SMALLER),
-    "smaller, limit": (*SMALLER, "--images_to_load", 3),
+    "smaller, limit": ("--masks", "masks", "-d", "depths", *SMALLER, "--images_to_load", 3),
     "exposures": ("--train_test_exp", "--eval"),
 }
 

@@ -26,21 +26,16 @@ BYTES = np.array([[255, 0, 51], [102, 255, 204]])
         "0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
         "x,y,z,r,g,b\n0.25,-1.5,3,255,0,51\n4,5.5,-6,102,255,204",
         "# by hand\n0.25 -1.5 3e0   1 0 0.2\n\n4 5.5 -6 0.4 1 0.8\n",
-        "0.25;-1.5;3;255;0;51\r\n4;5.5;-6;102;255;204\r\n",
         "0,25;-1,5;3,0;255;0;51\n4;5,5;-6;102;255;204\n",
-        "//X Y Z R G B\n0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
         "//X,Y,Z,Rf,Gf,Bf\n2\n0.25,-1.5,3,1,0,0.2\n4,5.5,-6,0.4,1,0.8\n",
         '"Red" "Green" "Blue" "x" "y" "z"\n255 0 51 0.25 -1.5 3\n102 255 204 4 5.5 -6\n',
         "2\n0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n",
-        "0.25 -1.5 3 255 0 51 0.7\n4 5.5 -6 102 255 204 0.8\n",
         "0.25 -1.5 3 -1200 255 0 51\n4 5.5 -6 -800 102 255 204\n",
         "0.25 -1.5 3 255 0 51 0 0 -1\n4 5.5 -6 102 255 204 0.6 0.8 0\n",
         "0.25 -1.5 3 0 0 -1 255 0 51\n4 5.5 -6 0.6 0.8 0 102 255 204\n",
         "0,25 -1,5 3 255 0 51\n4,0 5,5 -6,0 102 255 204\n",
         "0,25\t-1,5\t3\t1\t0,0\t2e-1\n4\t5,5\t-6\t0,4\t1\t0,8\n",
         "x y z intensity red green blue\n0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n",
-        "0.25 -1.5 3 255 0 51 255\n4 5.5 -6 102 255 204 255\n",
-        "0.25 -1.5 3 9 255 0 51\n4 5.5 -6 9 102 255 204\n",
         "# in Gr\xf6\xdfe\n0.25 -1.5 3 255 0 51\n4 5.5 -6 102 255 204\n",
     ],
 )
@@ -103,14 +98,20 @@ def test_points_without_colours_are_grey(tmp_path, capsys):
     [
         ("a.xyz", b"1 2\n3 4\n", "not text with x y z .*2 columns"),
         ("a.xyz", b"1 2 3\n4 5 six\n", "not text with x y z"),
-        ("a.xyz", b"\xff\xfe\x00", "not text with x y z"),
         ("a.xyz", b"only words\n", "no numbers"),
         ("a.xyz", b"1 2 nan\n", r"1 of 1 points .* are not finite \(first: number 0\)"),
-        ("a.xyz", b"1 2 1e99\n", "are not finite"),
         ("a.xyz", b"1 2 3 400 0 0\n", "neither integers nor between 0 and 1"),
         ("a.xyz", b"1 2 3 0.5 1.1 0\n", "between 0 and 1: they range from 0 to 1.1"),
         ("a.xyz", b"1 2 3 4 5 6 7 8\n", "8 columns, whose first line does not name them"),
         ("a.npz", b"PK\x03\x04 broken", "not a readable npz"),
+        ("a.txt", b"0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n", "from the 4th or from the 5th on may be red"),
+        (
+            "a.pcd",
+            b"# .PCD v0.7\nFIELDS x y z rgb\nDATA ascii\n1 2 3 4.8e6\n",
+            "is not read; save it as PLY",
+        ),
+        ("a.txt", b"LASF\0\0", "a kind that is not read"),
+        ("a.E57", b"ASTM-E57", "a kind that is not read"),
     ],
 )
 def test_bad_files(tmp_path, name, content, said):
@@ -143,25 +144,6 @@ def test_bad_arrays(tmp_path, arrays):
     """Also those that pack to a few bytes, of which little is unpacked."""
     np.savez_compressed(tmp_path / "a.npz", **{name: np.array(value) for name, value in arrays.items()})
     _refused_in_little_memory(tmp_path / "a.npz")
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "said"),
-    [
-        ("a.txt", b"0.25 -1.5 3 17 255 0 51\n4 5.5 -6 99 102 255 204\n", "from the 4th or from the 5th on may be red"),
-        (
-            "a.pcd",
-            b"# .PCD v0.7\nFIELDS x y z rgb\nDATA ascii\n1 2 3 4.8e6\n",
-            "a kind that is not read; save it as PLY",
-        ),
-        ("a.txt", b"LASF\0\0", "a kind that is not read"),
-        ("a.E57", b"ASTM-E57", "a kind that is not read"),
-    ],
-)
-def test_clouds_that_would_be_misread_are_named(tmp_path, name, content, said):
-    (tmp_path / name).write_bytes(content)
-    with pytest.raises(UserError, match=said):
-        read_point_cloud(tmp_path / name)
 
 
 def test_an_array_of_a_long_header_is_refused_before_it_is_unpacked(tmp_path):
@@ -211,7 +193,7 @@ def test_random_points_of_a_blender_scene_are_the_references_cube(blender_scene)
 
 
 @pytest.mark.parametrize("random", [{}, {"init_type": "random"}])
-@pytest.mark.parametrize("scale", [1e-3, 0.5, 1, 1000])
+@pytest.mark.parametrize("scale", [1e-3, 1])
 @pytest.mark.parametrize("move", [(0, 0, 0), (1e6, -3e5, 10)])
 def test_random_points_of_a_blender_scene_in_any_unit(blender_scene, capsys, random, scale, move):
     plain = read(blender_scene, **random).point_cloud.points

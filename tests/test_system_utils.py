@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from utils import system_utils
-from utils.system_utils import UserError, atomic_write, mkdir_p, run_cli, saved_iterations, searchForMaxIteration
+from utils.system_utils import UserError, atomic_write, run_cli, saved_iterations, searchForMaxIteration
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -113,15 +113,6 @@ def test_atomic_write_replaces_only_when_the_block_ends_well(tmp_path):
         raise RuntimeError
     assert target.read_text() == "whole"
     assert list(target.parent.iterdir()) == [target]
-
-
-def test_mkdir_p(tmp_path):
-    mkdir_p(tmp_path / "a" / "b")
-    mkdir_p(tmp_path / "a" / "b")
-    assert (tmp_path / "a" / "b").is_dir()
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="cannot create the folder .*file"):
-        mkdir_p(tmp_path / "file" / "below")
 
 
 def test_iterations_are_compared_as_numbers(tmp_path):

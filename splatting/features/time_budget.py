@@ -53,7 +53,7 @@ class TimeBudget(Part):
         return self._schedule
 
     def begin(self, run: Any, state: Any) -> None:
-        schedule, cameras = self._schedule, run.scene.getTrainCameras()
+        schedule, cameras = run.schedule, run.scene.getTrainCameras()
         schedule.random = run.scene.info.has_random_points
         schedule.short = SHORT[run.device.type]
         schedule.megapixels = run.scene.training_pixels()[0] / len(cameras) / 1e6

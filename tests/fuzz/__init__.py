@@ -1,11 +1,10 @@
-"""Random damage to everything that a user can give: files, options, and arguments of the rasterizer.
+"""Random damage to everything that a user can give: files and options.
 
 python -m tests.fuzz SECONDS SEED
 
 __main__                             the command line
 damage                               changes of bytes and of nested values
-files, models, pickles, pictures, options, rasterizer
-                                     the kinds of cases
+files, models, pickles, pictures, options   the kinds of cases
 crafted_pickles                      hostile files of torch.save, one by one
 worker                               a process that runs cases and measures them
 sandbox                              starts workers, and notices when one crashes or hangs
@@ -24,5 +23,4 @@ KINDS = {
     "crafted": "pickles:Crafted",
     "picture": "pictures:Picture",
     "options": "options:Options",
-    "rasterizer": "rasterizer:Rasterizer",
 }

@@ -5,7 +5,6 @@ import re
 import struct
 import zlib
 from collections.abc import Callable
-from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -22,7 +21,7 @@ from groundwork.files.image_files import write_plane
 from scene import Scene, colmap_loader
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
-from scene.readers import depth_maps, depth_scale
+from scene.readers import depth_scale
 from scene.readers.colmap import ColmapModel, read_model, read_model_of_kind
 from scene.readers.depth_maps import (
     DepthMap,
@@ -137,17 +136,6 @@ def test_every_picture_has_its_map(scene, capsys):
     for name, depth in depths.items():
         assert depth == DepthMap((scene / "depths" / name).with_suffix(".png"), 65536.0, 1.0, 0.0)
     assert len(_depths(scene, hold_out=True)) == 14
-
-
-def test_readers_and_cameras_have_one_rule_for_scales():
-    view = CameraInfo(0, np.eye(3), np.zeros(3), 1.0, 1.0, width=4, height=3)
-    for scale, median in product((-1.0, 0.0, 0.19, 0.2, 5.0, 5.1), ({}, {"med_scale": 1.0}, {"med_scale": 0.0})):
-        params = {"scale": scale, "offset": 0.5, **median}
-        named, fit = depth_maps.with_map(view, "a.png", params, 1.0).depth, depth_maps.depth_fit(params)
-        reliable = scale > 0 and (not median or (median["med_scale"] == 1 and 0.2 <= scale <= 5))
-        assert (named is not None) == fit.reliable == reliable
-        if named:
-            assert (named.scale, named.offset) == (fit.scale, fit.offset) == (scale, 0.5)
 
 
 def test_unreliable_and_unknown_scales_give_no_loss_and_one_message(scene, capsys):

@@ -111,17 +111,14 @@ def test_a_finished_training_without_its_last_checkpoint_is_not_said_to_continue
     assert "of 12 iterations, and this one starts over\n" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("content", "said"), [(None, "has a model, and no checkpoint to continue"), ("{", "model.json")]
-)
-def test_a_model_of_which_nobody_knows_that_it_is_unfinished_is_not_replaced(colmap_scene, tmp_path, content, said):
+def test_a_model_of_which_nobody_knows_that_it_is_unfinished_is_not_replaced(colmap_scene, tmp_path):
     """The model is one of the reference, or has a damaged file."""
     _train(colmap_scene, tmp_path, 5, "--no_last_checkpoint")
     (tmp_path / "model.json").unlink()
-    if content:
-        (tmp_path / "model.json").write_text(content)
-    with pytest.raises(UserError, match=said):
-        _train(colmap_scene, tmp_path, 9, "--resume")
+    for said in ("has a model, and no checkpoint to continue", "model.json"):
+        with pytest.raises(UserError, match=said):
+            _train(colmap_scene, tmp_path, 9, "--resume")
+        (tmp_path / "model.json").write_text("{")
 
 
 def test_a_training_of_another_length_leaves_a_checkpoint_that_seconds_continue(colmap_scene, tmp_path, capfd):
