@@ -147,7 +147,7 @@ def test_utils_has_the_names_of_the_reference_at_its_top():
 
 
 def test_an_application_imports_no_other():
-    """It calls another by groundwork/applications.py, as the other may be deleted."""
+    """Require calls by groundwork/applications.py between applications, as each may be deleted."""
     for path in (path for path in _python() if "applications" in path.relative_to(ROOT).parts):
         own = ".".join(path.relative_to(ROOT).parts[:2])
         assert [name for name in _imports(path) if _within(name, "applications") and not _within(name, own)] == [], path
