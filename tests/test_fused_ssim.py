@@ -285,20 +285,3 @@ def test_messages_of_a_gpu(device: str) -> None:
     for message, (maps, gradient) in refused.items():
         with pytest.raises((RuntimeError, TypeError), match=message):
             torch.ops.fused_ssim.l1_ssim_vjp(image, image, maps, gradient, gradient)
-
-
-_LOSSES = {
-    "both means": lambda one, two: sum(fused_l1_ssim(one, two)),
-    "photometric": lambda one, two: fused_photometric_loss(one, two, 0.2)[0],
-}
-
-
-@CPU_AND_GPU
-@pytest.mark.parametrize("loss", _LOSSES.values(), ids=_LOSSES)
-def test_torch_compile_gives_the_same_values_and_gradients(loss, device):
-    one, two = (image.to(device) for image in image_pair("noise", (3, 20, 20), torch.float32))
-    one.requires_grad_()
-    torch._dynamo.reset()
-    values = [call(one, two) for call in (loss, torch.compile(loss, backend="aot_eager"))]
-    assert torch.equal(*values)
-    assert torch.equal(*(torch.autograd.grad(value, one)[0] for value in values))
