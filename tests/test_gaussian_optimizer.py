@@ -38,15 +38,18 @@ def _step(optimizers: list[torch.optim.Optimizer], generator: torch.Generator, *
 
 
 def test_steps_and_states_are_those_of_torch():
-    """Take 50 steps; after 25 each optimiser goes on from the state dict of the other."""
+    """Take 50 steps; after 25 a new optimiser of each kind goes on from the state dict of the other."""
     ours = GaussianAdam(groups())
     theirs = torch.optim.Adam(groups(), lr=0.0, eps=1e-15)
     generator = torch.Generator().manual_seed(1)
     for step in range(50):
         if step == 25:
-            states = [copy.deepcopy(optimizer.state_dict()) for optimizer in (theirs, ours)]
-            ours.load_state_dict(states[0])
-            theirs.load_state_dict(states[1])
+            new = GaussianAdam(groups()), torch.optim.Adam(groups(), lr=0.0, eps=1e-15)
+            for optimizer, other in zip(new, (theirs, ours), strict=True):
+                optimizer.load_state_dict(copy.deepcopy(other.state_dict()))
+                for mine, group in zip(optimizer.param_groups, other.param_groups, strict=True):
+                    mine["params"][0].data.copy_(group["params"][0].detach())
+            ours, theirs = new
         ours.param_groups[0]["lr"] = theirs.param_groups[0]["lr"] = 1e-2 * 0.97**step
         _step([ours, theirs], generator)
     for mine, other in zip(ours.param_groups, theirs.param_groups, strict=True):
