@@ -80,6 +80,16 @@ def test_without_it_the_third_value_is_zero_and_all_others_are_the_same(planes):
         torch.testing.assert_close(absolute[name], value, rtol=1e-12, atol=1e-12)
 
 
+def test_gaussians_that_are_not_seen_have_none():
+    inputs = {name: t.double() for name, t in _scene().items()}
+    inputs["means"][::3, 2] *= -1  # behind the camera
+    inputs["sh_dc"][1] = torch.nan
+    got = gradients(inputs, _camera(torch.float64), want_absolute_gradient=True)["d means2d"]
+    assert not got[::3].any() and not got[1].any() and got.isfinite().all()
+    none = {name: t[:0] for name, t in inputs.items()}
+    assert gradients(none, _camera(torch.float64), want_absolute_gradient=True)["d means2d"].shape == (0, 3)
+
+
 def test_the_statistics_add_up_lengths_as_they_are():
     statistics, lengths = Statistics.zero(4, "cpu"), torch.tensor([1e-30, 0.1, 3.0, 7.0])
     radii = torch.tensor([1, 5, 0, 2], dtype=torch.int32)

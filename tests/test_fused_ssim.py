@@ -1,13 +1,15 @@
-"""fused_ssim against float64 convolutions, the CPU and itself. tests/test_loss_utils.py: against SciPy."""
+"""fused_ssim against float64 convolutions, scikit-image, finite differences, the CPU and itself."""
 
 import pytest
 import torch
 from fused_ssim import allowed_padding, fused_l1_ssim, fused_photometric_loss, fused_ssim
-from fused_ssim.reference import l1_ssim
+from fused_ssim.reference import l1_ssim, ssim_map
 from rasterizer_tools import BOTH_AND_GPU, CPU_AND_GPU, GPU_MARKS, moved_by_a_word
+from skimage.metrics import structural_similarity
 from torch import Tensor
 
 EPS = {torch.float32: 2**-24, torch.float64: 2**-53}
+LARGEST_SLOPE = 2 / 0.03**2  # of SSIM over a covariance; multiplies an error of the inputs or of the oracle
 on_a_gpu = pytest.mark.parametrize("device", [pytest.param("cuda", marks=GPU_MARKS)])
 
 
@@ -97,6 +99,27 @@ def test_agrees_with_the_cpu(shape: tuple[int, ...], as_bytes: bool, device: str
         assert abs(results[0] - wanted[0]) <= 2 * EPS[torch.float32] * wanted[0]
         assert abs(results[1] - wanted[1]) <= 8 * EPS[torch.float32]
         assert (results[2] - wanted[2]).abs().max() <= 40 * EPS[torch.float32] * wanted[2].abs().max()
+
+
+@pytest.mark.parametrize("name", ["noise", "salt on white"])
+def test_agrees_with_scikit_image(name: str) -> None:
+    img1, img2 = image_pair(name)
+    wanted, full = structural_similarity(
+        img1.numpy(),
+        img2.numpy(),
+        channel_axis=0,
+        data_range=1,
+        gaussian_weights=True,  # cut at 3.5 sigma: 11 taps
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )
+    # scikit-image averages without a rim of 5 pixels, where its border would differ from ours. Its variances are
+    # E[x²] - mu², divided by C2 at worst.
+    tolerance = 20 * EPS[torch.float64] * LARGEST_SLOPE
+    assert abs(float(fused_ssim(img1, img2, padding="valid")) - wanted) < tolerance
+    difference = (ssim_map(img1, img2) - torch.from_numpy(full))[:, 5:-5, 5:-5].abs().max()
+    assert difference < tolerance  # scikit-image also checks the oracle
 
 
 @CPU_AND_GPU
@@ -285,3 +308,20 @@ def test_messages_of_a_gpu(device: str) -> None:
     for message, (maps, gradient) in refused.items():
         with pytest.raises((RuntimeError, TypeError), match=message):
             torch.ops.fused_ssim.l1_ssim_vjp(image, image, maps, gradient, gradient)
+
+
+_LOSSES = {
+    "both means": lambda one, two: sum(fused_l1_ssim(one, two)),
+    "photometric": lambda one, two: fused_photometric_loss(one, two, 0.2)[0],
+}
+
+
+@CPU_AND_GPU
+@pytest.mark.parametrize("loss", _LOSSES.values(), ids=_LOSSES)
+def test_torch_compile_gives_the_same_values_and_gradients(loss, device):
+    one, two = (image.to(device) for image in image_pair("noise", (3, 20, 20), torch.float32))
+    one.requires_grad_()
+    torch._dynamo.reset()
+    values = [call(one, two) for call in (loss, torch.compile(loss, backend="aot_eager"))]
+    assert torch.equal(*values)
+    assert torch.equal(*(torch.autograd.grad(value, one)[0] for value in values))

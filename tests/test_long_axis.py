@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from scene.gaussians.long_axis import SHIFT, SHRINK, long_axis_children
+from scene.gaussians.long_axis import OVERLAP, SHIFT, SHRINK, long_axis_children
 from utils.general_utils import build_scaling_rotation
 
 EPSILON = 2.0**-23  # of the float32 numbers that a child is rounded to
@@ -81,6 +81,18 @@ def test_the_picture_covers_as_much_as_before(logit):
     assert (both - parent).abs().sum() < (0.13 if faint else 0.23) * parent.sum()
 
 
+def test_children_of_a_wider_split_would_come_apart():
+    """SHIFT is the largest: the mixture has its one maximum in the middle, and is flat there."""
+    x = torch.linspace(-3, 3, 601, dtype=torch.float64)
+
+    def mixture(shift: float) -> Tensor:
+        return sum(torch.exp(-0.5 * (x - s) ** 2 / (1 - shift * shift)) for s in (shift, -shift))
+
+    assert mixture(SHIFT).argmax() == 300 and mixture(SHIFT + 0.02).argmax() != 300
+    assert pytest.approx(1) == SHIFT**2 + SHRINK**2
+    assert pytest.approx(math.exp(-1)) == OVERLAP
+
+
 def test_extremes_stay_finite():
     opacity = torch.tensor([[-3e38], [-800.0], [-100.0], [100.0], [3e38]])
     xyz, scaling, rotation, _ = _parents(5)
@@ -90,3 +102,11 @@ def test_extremes_stay_finite():
     assert float(children["opacity"][4].sigmoid()) == pytest.approx(0.7603, abs=1e-4)
     empty = long_axis_children(*(t[:0] for t in (xyz, scaling, rotation, opacity)))
     assert [tuple(rows.shape) for rows in empty.values()] == [(0, 3), (0, 3), (0, 1)]
+
+
+def test_any_number_of_threads_gives_the_same(threads):
+    parents, results = _parents(40_001), []
+    for count in (1, 2, 3):
+        threads(count)
+        results.append(long_axis_children(*parents))
+    assert all(torch.equal(rows, other[name]) for other in results[1:] for name, rows in results[0].items())

@@ -128,10 +128,27 @@ def beside_other_work() -> None:
     assert all(same_bits(result, wanted) for result in results)
 
 
+def any_room() -> None:
+    """More room changes no bit. With less, the step halts, and the next one that has enough is as if nothing was."""
+    view = View(30_000, 90, 75)
+    wanted, words = view.both(), torch.zeros(6, dtype=torch.int64, device="cuda")
+    for step, more in enumerate((0, 1, 255, 256, 100_000, 3_000_000), 1):
+        got = view.ahead(words, [room + more for room in view.room])
+        assert words[0] == 0 and same_bits(got, wanted), more
+        for place in range(2):
+            less = list(view.room)
+            less[place] -= 1
+            view.ahead(words, less)
+            view.ahead(words, view.room)
+            assert words[0] == step + 1 and words[5] == step
+            words[0] = 0
+
+
 CASES = {
     "lists of thousands": "lists_of_thousands(False)",
     "lists of thousands with depth": "lists_of_thousands(True)",
     "beside other work": "beside_other_work()",
+    "any room": "any_room()",
 }
 
 

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from diff_gaussian_rasterization.optim import observe_
+from diff_gaussian_rasterization.optim import adam_, observe_, sparse_adam_
 from rasterizer_tools import GPU_MARKS, gradients, scene_arguments
 
 from tests.workloads.splat_scenes import SplatScene, frustum
@@ -42,6 +42,33 @@ def test_gradients_do_not_depend_on_how_many_instances_there_are():
     for name in few:
         if name.startswith("d "):
             assert torch.equal(many[name][: len(left)], few[name]), name
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+def test_a_guarded_step_marks_and_stops_as_on_the_cpu(sparse):
+    generator = torch.Generator().manual_seed(9)
+    seen = torch.arange(5000) % 3 != 1
+    states = []
+    for device in ("cpu", "cuda"):
+        state = [torch.rand(5000, 45, generator=generator.manual_seed(1)).to(device) for _ in range(3)]
+        stopped, loss = torch.zeros(1, dtype=torch.int64, device=device), torch.tensor(0.5, device=device)
+        kept = []
+        for iteration in range(1, 6):
+            gradient = torch.randn(5000, 45, generator=generator).to(device)
+            if iteration == 3:
+                gradient[::501], gradient[7, 3] = torch.nan, 1e25
+            guard = (loss, stopped, iteration)
+            if sparse:
+                sparse_adam_(state[0], gradient, *state[1:], seen.to(device), 1e-2, 0.9, 0.999, 1e-15, 9, *guard)
+            else:
+                lists = [[t] for t in (state[0], gradient, *state[1:], torch.tensor(float(iteration)))]
+                adam_(*lists, [1e-2], 0.9, 0.999, 1e-15, [9], *guard)
+            kept.append([t.nan_to_num(nan=77.0) for t in state])
+        assert stopped == 3 and all(torch.equal(a, b) for a, b in zip(kept[2], kept[4], strict=True))
+        states.append([t.cpu() for t in kept[4]])
+    assert torch.equal(states[0][1] == 77, states[1][1] == 77) and (states[0][1] == 77).any()
+    for got, wanted in zip(states[1], states[0], strict=True):
+        torch.testing.assert_close(got, wanted, rtol=1e-6, atol=1e-6)  # some units in the last place
 
 
 def test_density_statistics_are_the_cpus_to_the_bit():

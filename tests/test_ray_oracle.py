@@ -100,6 +100,14 @@ def test_small_gaussians_look_as_with_ewa(lens):
         assert difference < (most if lens else 2 * size * most / 0.1), size
 
 
+def test_given_covariances_are_those_of_scales_and_rotations():
+    values, view = one((0.4, 0.1, 1.0), (0.3, 0.1, 0.5)), camera(FISHEYE)
+    RS = reference.shape.rotation_matrices(values["rotations"]) * values["scales"][:, None]
+    upper = (RS @ RS.transpose(1, 2))[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    given = {name: values[name] for name in ("means", "opacities", "colors")} | {"cov3d": upper}
+    assert (alpha(values, view) - alpha(given, view)).abs().max() < 1e-13
+
+
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"])
 def test_rays_are_pycolmaps(model):
     found = make_lens(model, 30.0, WIDTH, HEIGHT)

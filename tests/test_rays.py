@@ -5,9 +5,11 @@ Images and gradients: test_rasterizer_oracle.py.
 
 import json
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from diff_gaussian_rasterization.lens import Lens
 from PIL import Image
 from rasterizer_tools import few, leaves, render
@@ -15,6 +17,7 @@ from rasterizer_tools import few, leaves, render
 import export
 import render as command
 import train
+from gaussian_renderer import rasterizer_settings
 from tests.workloads.splat_scenes import settings
 
 SMALL = Lens("equidistant", (9.0, 9.0), (8.5, 3.0))
@@ -35,6 +38,15 @@ def test_a_gaussian_of_no_extent_along_an_axis_has_gradients(lens):
     inputs = leaves(parameters)
     render(inputs, settings(**arguments, projection="ray", lens=lens)).color.sum().backward()
     assert all(values.grad.isfinite().all() for values in inputs.values())
+
+
+def test_a_view_takes_the_projection_of_the_options():
+    still = SimpleNamespace(world_view_transform=None, full_proj_transform=None, camera_center=None)
+    camera = SimpleNamespace(image_height=7, image_width=18, FoVx=1.0, FoVy=1.0, lens=SMALL, **vars(still))
+    model, pipe = SimpleNamespace(active_sh_degree=0), SimpleNamespace(debug=False, projection="ray")
+    made = rasterizer_settings(camera, model, pipe, torch.zeros(3))
+    assert made.projection == "ray" and made.lens is SMALL
+    assert rasterizer_settings(camera, model, SimpleNamespace(debug=False), torch.zeros(3)).projection == "ewa"
 
 
 def test_a_training_on_rays_renders_so_and_exports_say_it(colmap_scene, tmp_path, monkeypatch, capsys):

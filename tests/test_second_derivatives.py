@@ -5,7 +5,7 @@ import torch
 import torch.utils.checkpoint
 from fused_ssim import fused_ssim
 from fused_ssim.ops import fused_photometric_loss
-from rasterizer_tools import activated, few, render
+from rasterizer_tools import activated, few, ops, render, scene_arguments
 from torch import Tensor, autograd, func
 from torch.autograd import forward_ad
 
@@ -14,6 +14,11 @@ from tests.workloads.splat_scenes import settings
 RAW, SIZE = few(dtype=torch.float32)
 SPLATS, CAMERA = activated(RAW), settings(**SIZE)
 PHOTO = torch.rand(3, 12, 13, generator=torch.Generator().manual_seed(1))
+
+
+def _sum_by_operator(means: Tensor) -> Tensor:
+    scene = scene_arguments(SPLATS | {"means": means}, CAMERA, raw=False)
+    return ops.rasterize(torch.zeros_like(means), *scene, CAMERA.bg, False, True)[0].sum()
 
 
 # Scalar functions of a tensor, and a value of it. A sum has a constant gradient, and a square has not.
@@ -60,6 +65,20 @@ SECOND = {
 def test_no_derivative_is_silently_zero(function, way):
     with pytest.raises(RuntimeError, match="no second derivative|jvp|vmap"):
         SECOND[way](*FUNCTIONS[function])
+
+
+# Called by themselves, operators drop tangents as every operator of torch's library does; so only reverse mode.
+OPERATORS = {
+    "rasterize": (_sum_by_operator, SPLATS["means"]),
+    "the photometric loss": (lambda image: torch.ops.fused_ssim.photometric(image, PHOTO, 0.2, True)[0], PHOTO / 2),
+}
+
+
+@pytest.mark.parametrize("way", ["penalty", "penalty by backward"])
+@pytest.mark.parametrize("name", OPERATORS)
+def test_the_operators_themselves_raise_too(name, way):
+    with pytest.raises(RuntimeError, match=f"{name} has no second derivative"):
+        SECOND[way](*OPERATORS[name])
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)

@@ -8,6 +8,7 @@ import pytest
 import torch
 from diff_gaussian_rasterization.density import split_positions
 from rasterizer_tools import CPU_AND_GPU
+from scipy import stats
 from torch import Tensor
 
 from groundwork.deterministic.counter_rng import Stream, random_bits
@@ -71,3 +72,14 @@ def test_broken_parents_harm_nobody_else(device):
     got = split_positions(*parents, **WHERE)
     assert torch.equal(got[[0, 5]], expected[[0, 5]]) and torch.equal(got[1, :2], expected[1, :2])
     assert got[1, 2].isnan() and got[2].isnan().any() and got[3].isnan().all() and not got[4].isnan().any()
+
+
+def test_children_are_normal_about_their_parent_and_independent():
+    count = 50_000
+    upright = torch.tensor([1.0, 0, 0, 0]).expand(count, 4)
+    zeros = torch.zeros(count, 3)
+    values = split_positions(zeros, zeros, upright, torch.arange(count), **WHERE).numpy()
+    # The numbers are fixed, so the p-value is a constant; a value below 1e-3 would mean a fault.
+    assert stats.kstest(values.ravel(), "norm").pvalue > 1e-3
+    correlation = np.corrcoef(values.T) - np.eye(3)
+    assert np.abs(correlation).max() < 4.5 / np.sqrt(count)  # 4.5 standard errors of 3 correlations
