@@ -67,36 +67,6 @@ def test_channels_equal_triples(make, channels, projection, device, dtype):
 
 
 @CPU_AND_GPU
-def test_colours_come_before_features(device):
-    """SH, with a depth as the fourth channel, and the transmittance; gradients of the camera's pose, too."""
-    scene = ordinary(200)
-    camera = move_camera(scene.settings(), device)
-    given = {k: v.to(device) for k, v in activated(scene.parameters).items()}
-    depth = given["means"][:, 2:].clone()
-    found = []
-    for together in (False, True):
-        inputs = leaves(given | {"depth": depth, "view": camera.viewmatrix, "full": camera.projmatrix})
-        own, view, full = (inputs.pop(name) for name in ("depth", "view", "full"))
-        posed = camera._replace(viewmatrix=view, projmatrix=full)
-        means2d = torch.zeros_like(inputs["means"])
-        if together:
-            black = torch.cat([camera.bg, camera.bg.new_zeros(1)])
-            out = rasterize_channels(means2d=means2d, settings=posed._replace(bg=black), features=own, **inputs)
-            image, transmittance = out.image, out.transmittance
-        else:
-            out = rasterize(means2d=means2d, settings=posed, want_transmittance=True, **inputs)
-            others = {k: v for k, v in inputs.items() if not k.startswith("sh")}
-            none = posed._replace(bg=torch.zeros_like(camera.bg))
-            more = rasterize(means2d=means2d, settings=none, colors=own.expand(-1, 3) / 3, **others)
-            image, transmittance = torch.cat([out.color, more.color.sum(0, keepdim=True)]), out.transmittance
-        (loss_of(image) + transmittance.square().sum()).backward()
-        found.append({"image": image, "depth": own.grad, "view": view.grad, "full": full.grad}
-                     | {name: t.grad for name, t in inputs.items()})  # fmt: skip
-    for name, expected in found[0].items():
-        assert error(found[1][name], expected).largest < 3e-5, name
-
-
-@CPU_AND_GPU
 def test_what_is_not_needed_gets_no_gradient(device):
     """Features alone; and the background, of which the gradient is the sum of what is left."""
     scene = ordinary(100)

@@ -43,26 +43,6 @@ def test_operators_have_the_bits_of_the_formulas(device):
     assert torch.equal(random_bits(2**63 + 5, Stream.SPLIT, 600, items.to(device), 1).cpu(), wanted)
 
 
-def test_numbers_depend_on_the_item_not_on_the_batch():
-    together = random_bits(5, Stream.SPLIT, 700, torch.arange(1000), 1)
-    alone = random_bits(5, Stream.SPLIT, 700, torch.tensor([123]), 1)
-    assert torch.equal(together[123:124], alone)
-
-
-def test_every_argument_matters():
-    items = torch.arange(64)
-    base = random_bits(1, Stream.SPLIT, 10, items, 0)
-    for other in (
-        random_bits(2, Stream.SPLIT, 10, items, 0),
-        random_bits(1 + 2**32, Stream.SPLIT, 10, items, 0),
-        random_bits(1, Stream.BACKGROUND, 10, items, 0),
-        random_bits(1, Stream.SPLIT, 11, items, 0),
-        random_bits(1, Stream.SPLIT, 10, items, 1),
-        random_bits(1, Stream.SPLIT, 10, items + 64, 0),
-    ):
-        assert not (base == other).any(dim=1).all()
-
-
 def test_uniform_numbers_fill_the_half_open_interval():
     values = uniform(0, Stream.BACKGROUND, 1, torch.arange(50_000)).numpy()
     assert values.dtype == np.float32 and values.min() >= 0 and values.max() < 1

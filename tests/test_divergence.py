@@ -1,6 +1,5 @@
 """NaN and infinities in a training: the step that is not taken, the model that is saved, and the message."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -79,15 +78,6 @@ def test_values_without_a_finite_step_are_marked_and_the_rest_goes_on(step, dtyp
     last = [t.clone() for t in guarded]
     step(guarded, gradient, loss, stopped, 3)
     assert stopped == 2 and all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(guarded, last, strict=True))
-
-
-@pytest.mark.parametrize("loss", [NAN, INF, -INF])
-def test_there_is_no_step_under_a_loss_that_is_not_finite(step, loss):
-    stopped = torch.zeros(1, dtype=torch.int64)
-    (state, gradient), (before, _) = _state(torch.float32), _state(torch.float32)
-    step(state, gradient, torch.tensor(loss), stopped, 7)
-    step(state, gradient, torch.tensor(0.5), stopped, 8)
-    assert stopped == 7 and all(torch.equal(a, b) for a, b in zip(state, before, strict=True))
 
 
 # The training
@@ -188,12 +178,9 @@ def test_rates_a_hundred_times_too_high_end_in_a_warning(colmap_scene, tmp_path,
     rates |= {"scaling_lr": 0.5, "rotation_lr": 0.1}
     high = [word for name, rate in rates.items() for word in (f"--{name}", rate)]
     options = ["--densify_from_iter", 50, "--densification_interval", 50, "--opacity_reset_interval", 300]
-    ply = _train(colmap_scene, tmp_path / "high", *options, *high, iterations=300)
+    ply = _train(colmap_scene, tmp_path, *options, *high, iterations=300)
     read_model(ply).check_finite(300)
     assert "so the model is worse than its start; lower the learning rates" in capfd.readouterr().err
-    _train(colmap_scene, tmp_path / "usual", *options, iterations=150)
-    assert "the model is worse" not in capfd.readouterr().err
-    assert json.loads((tmp_path / "high" / "train_log.json").read_text())[-1]["loss"] > 0
 
 
 def test_a_start_that_no_view_shows(blender_scene, tmp_path):

@@ -46,6 +46,15 @@ def scenes(tmp_path_factory) -> tuple[Path, Path]:
     return folder / "usual", scaled_scene(folder / "usual", FACTOR, folder / "small")
 
 
+@pytest.fixture(scope="module")
+def models(scenes, tmp_path_factory) -> tuple[Path, Path]:
+    """The models of both scenes."""
+    outs = tuple(tmp_path_factory.mktemp("models") / scene.name for scene in scenes)
+    for scene, out in zip(scenes, outs, strict=True):
+        _train(scene, out, "--save_iterations", 20, 30, "--checkpoint_iterations", 10)
+    return outs
+
+
 def _train(scene: Path, out: Path, *more: object, iterations: int = 30) -> np.ndarray:
     """Train, and return the vertices of the PLY."""
     train.main(["-s", str(scene), "-m", str(out), "--iterations", str(iterations), *SMALL, *map(str, more)])
@@ -139,12 +148,11 @@ def _poses(out: Path) -> list:
     return json.loads((out / "poses.json").read_text())["train"]
 
 
-def test_files_have_the_scenes_own_unit(scenes, tmp_path, monkeypatch):
-    for scene in scenes:
-        _train(scene, tmp_path / scene.name, "--save_iterations", 20, 30)
-        monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(tmp_path / scene.name), "--skip_train", "--depth"])
+def test_files_have_the_scenes_own_unit(models, monkeypatch):
+    for out in models:
+        monkeypatch.setattr(sys, "argv", ["render.py", "-m", str(out), "--skip_train", "--depth"])
         render.main()
-    usual, small = tmp_path / "usual", tmp_path / "small"
+    usual, small = models
     centers = [
         [entry["position"] for entry in json.loads((out / "cameras.json").read_text())] for out in (usual, small)
     ]
@@ -161,22 +169,18 @@ def test_files_have_the_scenes_own_unit(scenes, tmp_path, monkeypatch):
             assert np.abs(images[0] - images[1]).mean() < 0.005 * images[0].max()
 
 
-def test_a_resumed_training_ends_with_the_bytes_of_one_that_was_not_stopped(scenes, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    _train(scenes[1], whole, "--checkpoint_iterations", 10)
-    _train(scenes[1], parts, "--start_checkpoint", whole / "chkpnt10.pth")
-    assert _ply(whole).read_bytes() == _ply(parts).read_bytes()
+def test_a_resumed_training_ends_with_the_bytes_of_one_that_was_not_stopped(scenes, models, tmp_path):
+    _train(scenes[1], tmp_path, "--start_checkpoint", models[1] / "chkpnt10.pth")
+    assert _ply(models[1]).read_bytes() == _ply(tmp_path).read_bytes()
 
 
-def test_a_file_keeps_the_enlargement_of_its_training(scenes, tmp_path):
-    _train(scenes[1], tmp_path / "out")
-    splats = read_splats(_ply(tmp_path / "out"))
-    assert splats.enlargement == json.loads((tmp_path / "out/model.json").read_text())["enlargement"]
-    assert read_splats(_ply(tmp_path / "out")).enlargement == splats.enlargement
-    options = _options(scenes[1], tmp_path / "out")
-    scene = load_file(options, str(_ply(tmp_path / "out")), argparse.Namespace(antialiasing=False))
+def test_a_file_keeps_the_enlargement_of_its_training(scenes, models, tmp_path):
+    ply = _ply(models[1])
+    splats = read_splats(ply)
+    assert splats.enlargement == json.loads((models[1] / "model.json").read_text())["enlargement"]
+    scene = load_file(_options(scenes[1], models[1]), str(ply), argparse.Namespace(antialiasing=False))
     assert splats_of(scene.gaussians).enlargement == splats.enlargement
-    _train(scenes[1], tmp_path / "next", "--init_ply", _ply(tmp_path / "out"))
+    _train(scenes[1], tmp_path / "next", "--init_ply", ply)
     assert json.loads((tmp_path / "next/model.json").read_text())["enlargement"] == splats.enlargement
 
 

@@ -1,16 +1,17 @@
-"""Our Adam against torch's, and the changes of its state when Gaussians come and go."""
+"""Our Adam, dense and sparse, against torch's: steps, states, inactive bands, and memory."""
 
 import copy
 import weakref
 
 import pytest
 import torch
+from diff_gaussian_rasterization import SparseGaussianAdam
 from gaussians import model, options, take_steps
 
 from scene.gaussians.adam import GaussianAdam
 
 
-def _groups(seed: int = 0) -> list[dict]:
+def groups(seed: int = 0) -> list[dict]:
     generator = torch.Generator().manual_seed(seed)
     shapes = {"xyz": (50, 3), "f_dc": (50, 1, 3), "opacity": (50, 1), "f_rest": (50, 15, 3)}
     return [
@@ -19,7 +20,12 @@ def _groups(seed: int = 0) -> list[dict]:
     ]
 
 
-def _step(optimizers: list[torch.optim.Optimizer], generator: torch.Generator) -> None:
+def values(optimizer: torch.optim.Optimizer) -> list[torch.Tensor]:
+    params = [group["params"][0] for group in optimizer.param_groups]
+    return [t.detach().clone() for p in params for t in (p, *optimizer.state[p].values())]
+
+
+def _step(optimizers: list[torch.optim.Optimizer], generator: torch.Generator, *visible: object) -> None:
     for groups in zip(*(optimizer.param_groups for optimizer in optimizers), strict=True):
         # Gradients of very different sizes, some exactly zero, like those of a rasterizer.
         shape = groups[0]["params"][0].shape
@@ -28,14 +34,22 @@ def _step(optimizers: list[torch.optim.Optimizer], generator: torch.Generator) -
         for group in groups:
             group["params"][0].grad = gradient.clone()
     for optimizer in optimizers:
-        optimizer.step()
+        optimizer.step(*visible)
 
 
-def test_steps_follow_torch():
-    ours = GaussianAdam(_groups())
-    theirs = torch.optim.Adam(_groups(), lr=0.0, eps=1e-15)
+def test_steps_and_states_are_those_of_torch():
+    """Take 50 steps; after 25 a new optimiser of each kind goes on from the state dict of the other."""
+    ours = GaussianAdam(groups())
+    theirs = torch.optim.Adam(groups(), lr=0.0, eps=1e-15)
     generator = torch.Generator().manual_seed(1)
     for step in range(50):
+        if step == 25:
+            new = GaussianAdam(groups()), torch.optim.Adam(groups(), lr=0.0, eps=1e-15)
+            for optimizer, other in zip(new, (theirs, ours), strict=True):
+                optimizer.load_state_dict(copy.deepcopy(other.state_dict()))
+                for mine, group in zip(optimizer.param_groups, other.param_groups, strict=True):
+                    mine["params"][0].data.copy_(group["params"][0].detach())
+            ours, theirs = new
         ours.param_groups[0]["lr"] = theirs.param_groups[0]["lr"] = 1e-2 * 0.97**step
         _step([ours, theirs], generator)
     for mine, other in zip(ours.param_groups, theirs.param_groups, strict=True):
@@ -50,37 +64,22 @@ def test_steps_follow_torch():
         torch.testing.assert_close(state["exp_avg_sq"], expected["exp_avg_sq"], rtol=1e-5, atol=0)
 
 
-@pytest.mark.parametrize("direction", ["ours to torch", "torch to ours"])
-def test_state_dicts_carry_over(direction):
-    ours, theirs = GaussianAdam(_groups()), torch.optim.Adam(_groups(), lr=0.0, eps=1e-15)
-    source, target = (ours, theirs) if direction == "ours to torch" else (theirs, ours)
-    generator = torch.Generator().manual_seed(1)
-    _step([source], generator)
-    target.load_state_dict(copy.deepcopy(source.state_dict()))
-    with torch.no_grad():
-        for mine, other in zip(source.param_groups, target.param_groups, strict=True):
-            other["params"][0].copy_(mine["params"][0])
-    _step([ours, theirs], generator)
-    for mine, other in zip(ours.param_groups, theirs.param_groups, strict=True):
-        torch.testing.assert_close(mine["params"][0], other["params"][0], rtol=0, atol=2**-22)
-        assert ours.state[mine["params"][0]]["step"] == 2
-
-
-def test_parameters_without_gradient_stay_and_do_not_count():
-    optimizer = GaussianAdam(_groups())
-    _step([optimizer], torch.Generator().manual_seed(0))
+@pytest.mark.parametrize("kind", [GaussianAdam, SparseGaussianAdam])
+def test_parameters_without_gradient_stay_and_do_not_count(kind):
+    """The sparse one does not read the rows then, which are of before a densification."""
+    optimizer = kind(groups(), lr=0.0, eps=1e-15) if kind is SparseGaussianAdam else kind(groups())
+    visible = [torch.ones(50, dtype=torch.bool), 50] if kind is SparseGaussianAdam else []
+    _step([optimizer], torch.Generator().manual_seed(0), *visible)
     optimizer.zero_grad(set_to_none=True)
-    before = [group["params"][0].detach().clone() for group in optimizer.param_groups]
-    optimizer.step()
-    for group, value in zip(optimizer.param_groups, before, strict=True):
-        assert torch.equal(group["params"][0], value)
-        assert optimizer.state[group["params"][0]]["step"] == 1
+    before = values(optimizer)
+    optimizer.step(*([torch.ones(7, dtype=torch.bool), 7] if visible else []))
+    assert all(torch.equal(*pair) for pair in zip(values(optimizer), before, strict=True))
 
 
 @pytest.mark.parametrize("columns", [0, 9, 24])
 def test_leaving_out_inactive_bands_changes_no_bit(columns):
     """A dense step of columns with zero gradient and moments equals the step that skips them."""
-    dense, sparse = GaussianAdam(_groups()), GaussianAdam(_groups())
+    dense, sparse = GaussianAdam(groups()), GaussianAdam(groups())
     sparse.set_active_columns("f_rest", columns)
     generator = torch.Generator().manual_seed(0)
     for _ in range(5):
@@ -93,15 +92,12 @@ def test_leaving_out_inactive_bands_changes_no_bit(columns):
                 b["params"][0].grad = None
         dense.step()
         sparse.step()
-    for a, b in zip(dense.param_groups, sparse.param_groups, strict=True):
-        assert torch.equal(a["params"][0], b["params"][0])
-        for key, value in dense.state[a["params"][0]].items():
-            assert torch.equal(value, sparse.state[b["params"][0]][key])
+    assert all(torch.equal(*pair) for pair in zip(values(dense), values(sparse), strict=True))
 
 
 @pytest.mark.parametrize("with_gradient", ["f_dc", "opacity"])
 def test_inactive_bands_count_along_with_the_base_colour(with_gradient):
-    optimizer = GaussianAdam(_groups())
+    optimizer = GaussianAdam(groups())
     optimizer.set_active_columns("f_rest", 0)
     param = {group["name"]: group["params"][0] for group in optimizer.param_groups}
     param[with_gradient].grad = torch.ones_like(param[with_gradient])

@@ -4,24 +4,18 @@ import io
 import json
 import time
 from itertools import count
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-import torch
 from tqdm import tqdm
 
 import train
 from groundwork.host.progress import Bar, in_threads
 from scene.gaussians.density_rules import Actions
-from splatting.log import ProgressBar
 from splatting.loop import standard_observers
-from splatting.objective import LossWatch
 from splatting.part import Part, Strategy
-from splatting.schedule import Schedule
 
 ITERATIONS = 24
-ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(autouse=True)
@@ -120,18 +114,6 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
     assert [t for hook, t in calls if hook == "after_step"] == list(steps[:-1])
 
 
-def test_backward_runs_on_the_callers_thread(colmap_scene, tmp_path, monkeypatch):
-    found = []
-
-    class Threads(Part):
-        def measured(self, step, losses) -> None:
-            found.append(torch.autograd.is_multithreading_enabled())
-
-    before = torch.autograd.is_multithreading_enabled()
-    _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Threads()])
-    assert not any(found) and torch.autograd.is_multithreading_enabled() is before
-
-
 def test_what_replaces_training_report_is_called(colmap_scene, tmp_path, monkeypatch):
     """Programs that import train.py as a module put their own in its place. Its seconds are none of training."""
     reported, clock = [], time.perf_counter
@@ -172,25 +154,7 @@ def test_a_log_gets_a_line_in_ten_seconds_and_a_last_one(monkeypatch, seconds):
     assert "0%" in shown.getvalue() and "100%" in shown.getvalue()
 
 
-def test_work_in_threads_is_one_line_of_a_log_wherever_it_is():
+def test_work_in_threads_is_one_line_of_a_log():
     log = io.StringIO()
     assert in_threads(lambda number: 2 * number, range(50), file=log, mininterval=0) == [*range(0, 100, 2)]
     assert log.getvalue().count("\n") == 1 and "\r" not in log.getvalue()
-    code = [
-        path
-        for room in ("applications", "groundwork", "scene", "splatting", "utils")
-        for path in (ROOT / room).rglob("*.py")
-    ]
-    assert [path.name for path in code if "tqdm.contrib" in path.read_text()] == ["progress.py"]
-
-
-def test_the_number_of_gaussians_is_exact(capsys):
-    run = SimpleNamespace(
-        losses=LossWatch(), parts=[], first_iteration=0,
-        schedule=Schedule(20), gaussians=SimpleNamespace(gaussian_count=123_456), clock=SimpleNamespace(seconds=1.0),
-        opt=SimpleNamespace(time_budget=0.0),
-    )  # fmt: skip
-    bar = ProgressBar(run)
-    bar.measured(SimpleNamespace(iteration=10, due=True, span=range(10, 11)), SimpleNamespace(terms={}))
-    bar.ended(None)
-    assert "Gaussians=123,456" in capsys.readouterr().err

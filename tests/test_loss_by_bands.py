@@ -10,7 +10,6 @@ from processes import in_ranks
 from rasterizer_tools import BOTH_AND_GPU, GPU_MARKS
 from torch import Tensor
 
-from gaussian_renderer.over_ranks import bands
 from gaussian_renderer.over_ranks.band import exchange_halo, gather_image
 from gaussian_renderer.over_ranks.bands import Bands, CachedBands, find_bands, processed_by_row, width_changes
 from groundwork.ranks.ranks import Ranks, ranks
@@ -134,22 +133,6 @@ class _Others(Ranks):
         others = [width_changes(rects, torch.ones(len(rects)), self._height) for rects in self._rects[1:]]
         widths = torch.stack((values[0], *others))
         return torch.stack((widths, values[1] * torch.tensor([[1], [0], [0]])), 1)
-
-
-def test_of_many_splats_a_sample_gives_the_bands(monkeypatch):
-    generator = torch.Generator().manual_seed(5)
-    top = torch.randint(60, (20_000,), generator=generator)
-    rects = torch.stack((torch.zeros_like(top), top, 1 + top % 3, top + 1 + top % 4), 1).int()
-    tile_counts = torch.randint(2, (20_000,), generator=generator)
-    rects[tile_counts == 0] = 1 << 30  # undefined
-    whole = width_changes(rects, tile_counts, 1000)
-    assert torch.equal(whole, width_changes(rects[tile_counts > 0], torch.ones(int(tile_counts.sum())), 1000))
-    monkeypatch.setattr(bands, "_SAMPLE", 4000)
-    part = width_changes(rects, tile_counts, 1000)
-    assert not torch.equal(part, whole)
-    ends = [widths.cumsum(0)[:-1].cumsum(0) / widths.cumsum(0)[:-1].sum() for widths in (whole, part)]
-    assert (ends[0] - ends[1]).abs().max() < 0.03
-    assert abs(int(part.cumsum(0).sum()) / int(whole.cumsum(0).sum()) - 1) < 0.1
 
 
 def test_bands_follow_what_an_earlier_visit_has_processed():

@@ -209,9 +209,6 @@ def test_attributes_that_are_not_optimised_keep_their_rows_in_step():
     assert torch.equal(gaussians._rotation, torch.cat((rotation[10:], rotation[10:13])))
 
 
-# Without an optimiser
-
-
 # GaussianAdam's groups
 
 

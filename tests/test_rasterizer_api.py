@@ -9,8 +9,7 @@ from diff_gaussian_rasterization import (
     cpu_deep_copy_tuple,
     rasterize_gaussians,
 )
-from diff_gaussian_rasterization.scene import draw
-from rasterizer_tools import activated, few, keywords, leaves, render, scene_arguments
+from rasterizer_tools import activated, few, keywords, leaves, render
 
 from tests.workloads.splat_scenes import settings
 
@@ -284,18 +283,6 @@ def test_copies_of_a_tuple_lie_on_the_cpu():
     assert torch.equal(copied[0], tensor) and copied[0].data_ptr() != tensor.data_ptr()
 
 
-@pytest.mark.parametrize("as_other", [torch.Tensor.numpy, torch.Tensor.tolist], ids=["array", "list"])
-def test_other_types_than_tensors_are_named(as_other):
-    splats, camera = scene()
-    calls = [(name, lambda n, v: render(splats | {n: v}, camera, torch.zeros(3, 3), raw=False)) for name in splats]
-    calls += [(n, lambda n, v: render(splats, camera._replace(**{n: v}), raw=False)) for n in ("viewmatrix", "bg")]
-    calls += [(name, lambda n, v: call(splats, camera, **{n: v})) for name in ("means3D", "means2D", "opacities")]
-    calls += [("sh", lambda _, v: call(splats, camera, shs=v))]
-    for name, function in calls:
-        with pytest.raises(TypeError, match=f"^{name} must be a tensor, got (numpy.ndarray|list)"):
-            function(name, as_other(torch.zeros(3, 3)))
-
-
 def test_one_gradient_alone_is_that_among_all():
     splats, camera = scene()
     everything = leaves(splats)
@@ -311,29 +298,18 @@ def test_one_gradient_alone_is_that_among_all():
     assert torch.equal(grad, everything["means"].grad)
 
 
-def _outputs(splats, camera, train: bool, inverse_depth: bool = True):
-    return draw(scene_arguments(splats, camera, False), camera.bg, inverse_depth, train)
-
-
-def test_nothing_is_kept_without_gradients():
+def test_without_gradients_there_is_the_same_image_and_no_graph():
+    """tests/test_costs.py: nor what a backward would need."""
     splats, camera = scene()
-    rendering, training = (_outputs(splats, camera, train, train)._asdict() for train in (False, True))
-    for name in ("splat_slots", "last", "inverse_depth", "layers"):
-        assert rendering[name].numel() == 0, name
-    assert len(rendering["slots"]) == 0
-    assert len(training["instances"]) == training["ranges"][-1] == training["tile_counts"].sum()
-    assert training["last"].shape == (7, 18)
-    assert torch.equal(rendering["color"], training["color"])
-    # The public function chooses by the grad mode and by its inputs.
+    trained = render(leaves(splats), camera, raw=False).color
     with torch.no_grad():
-        assert render(leaves(splats), camera, raw=False).color.grad_fn is None
-    assert render(splats, camera, raw=False).color.grad_fn is None
+        for inputs in (splats, leaves(splats)):
+            color = render(inputs, camera, raw=False).color
+            assert color.grad_fn is None and torch.equal(color, trained)
 
 
 def test_a_backward_that_has_nothing_to_go_on_says_what_is_wrong():
     splats, camera = scene()
-    with pytest.raises(RuntimeError, match="train=False"):
-        _outputs(leaves(splats), camera, False)[0].sum().backward()
     color = render(leaves(splats), camera, raw=False).color
     color.sum().backward(retain_graph=True)
     color.sum().backward()
@@ -373,6 +349,11 @@ WRONG = [
     ("tanfovx", float("inf"), "tan_x must be the tangent"),
     ("scale_modifier", float("nan"), "scale_modifier must be finite, got nan"),
     *(("shs", shs, r"shs must be \(N, K, 3\), got ") for shs in (torch.zeros(()), torch.zeros(3), torch.zeros(3, 3))),
+    *(
+        (name, other(torch.zeros(3, 3)), f"^{name.replace('shs', 'sh')} must be a tensor, got (numpy.ndarray|list)")
+        for name in (*scene()[0], "viewmatrix", "bg", "means3D", "means2D", "shs")
+        for other in (torch.Tensor.numpy, torch.Tensor.tolist)
+    ),
 ]
 
 
@@ -380,13 +361,13 @@ WRONG = [
 def test_wrong_inputs_and_settings_are_named(name, value, message):
     splats, camera = scene()
     with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
-        if name == "shs":
-            call(splats, camera, shs=value)
+        if name in ("shs", "means3D", "means2D"):
+            call(splats, camera, **{name: value})
         elif name in camera._fields:
             render(splats, camera._replace(**{name: value}), raw=False)
         else:
             render(splats | {name: value}, camera, torch.zeros(3, 3), raw=False)
-    if name == "scales" and value is not None:
+    if name == "scales" and "activated" in message:
         with pytest.raises(ValueError, match="logarithms"):
             render(few(dtype=torch.float32)[0] | {name: value}, camera, torch.zeros(3, 3))
 

@@ -4,14 +4,13 @@ import math
 
 import pytest
 import torch
-from rasterizer_tools import BOTH_AND_GPU, activated, few, move_camera, ops, pick, render, rigid, scene_arguments
+from rasterizer_tools import BOTH_AND_GPU, activated, few, move_camera, ops, pick, render, scene_arguments
 
 from tests.workloads.splat_scenes import settings
 from utils.sh_utils import RGB2SH
 
 # With steps of 1e-6, truncation and rounding leave errors of some 1e-9; a wrong term is far above 1e-6.
 CHECK = {"eps": 1e-6, "atol": 1e-7, "rtol": 1e-6}
-VIEW = rigid((0.95, 0.1, -0.15, 0.05), (0.1, -0.05, 0.2))
 
 
 def _check(parameters, camera, raw=True, **check):
@@ -36,13 +35,6 @@ def _check(parameters, camera, raw=True, **check):
 
     inputs = [parameters[name].detach().clone().requires_grad_() for name in names]
     assert torch.autograd.gradcheck(sums, inputs, **(CHECK | check))
-
-
-@pytest.mark.parametrize(("degree", "antialiasing"), [(0, True), (1, False), (3, True)])
-def test_raw_parameters(degree, antialiasing):
-    parameters, size = few()
-    parameters["sh_rest"] = parameters["sh_rest"][:, : max((degree + 1) ** 2 - 1, 3)]  # degree 0: bands not read
-    _check(parameters, settings(**size, view=VIEW, sh_degree=degree, antialiasing=antialiasing))
 
 
 @pytest.mark.parametrize(("side", "axis", "antialiasing"), [(-1, 0, True), (1, 0, False), (-1, 1, False), (1, 1, True)])
@@ -105,22 +97,12 @@ def test_the_antialiasing_factor_is_floored(side):
     focal = 17 / (2 * settings(**size).tanfovx)
     parameters["scales"][:] = math.log(s * 2 / focal)
     inputs = {name: t.clone().requires_grad_() for name, t in parameters.items()}
-
-    def at_middle(scales):
-        out = render(inputs | {"scales": scales}, settings(**size, antialiasing=True))
-        return 1 - out.transmittance[0, 3, 8]
-
     factor = max(0.005, s * s / (s * s + 0.3))
     opacity = torch.sigmoid(parameters["opacities"]).item()
-    alpha = at_middle(inputs["scales"])
+    alpha = 1 - render(inputs, settings(**size, antialiasing=True)).transmittance[0, 3, 8]
     assert alpha.item() == pytest.approx(opacity * factor, rel=1e-12)
     alpha.backward()
-    h = 1e-5
-    with torch.no_grad():
-        difference = (at_middle(inputs["scales"] + h) - at_middle(inputs["scales"] - h)) / (2 * h)
-    got = inputs["scales"].grad.sum().item()
-    assert got == pytest.approx(difference.item(), rel=1e-6, abs=1e-12)
-    assert (got == 0) == (side < 1)
+    assert (inputs["scales"].grad.sum() == 0) == (side < 1)  # test_rasterizer_oracle.py: its value
 
 
 @BOTH_AND_GPU

@@ -4,31 +4,24 @@ import pytest
 import torch
 from diff_gaussian_rasterization import fakes
 from diff_gaussian_rasterization.lens import Lens
-from diff_gaussian_rasterization.scene import draw
 from rasterizer_tools import few, ops, render, scene_arguments
 
 from groundwork.ranks.rows import BLOCK
 from tests.workloads.splat_scenes import settings
 
 
-def test_the_fake_kernels_have_the_sizes_of_the_real_ones():
+def test_the_fake_kernels_have_the_blocks_of_the_real_ones():
+    """Check where one block more begins; test_operator_arguments.py checks all other sizes."""
     raw, size = few(dtype=torch.float32)
     camera = settings(**size)
-    arguments = scene_arguments(raw, camera)
-    splats, depths, rects, counts, _ = ops.project(*arguments)
-    assert splats.shape[1] == fakes.SPLAT_VALUES
+    splats, depths, rects, counts, _ = ops.project(*scene_arguments(raw, camera))
+    no_rows = [splats, counts, splats.new_zeros(0, fakes.MOMENT_VALUES), 0 * counts]
+    for lens, numbers in zip((None, Lens("perspective", (9.0, 9.0), (8.0, 3.0))), fakes.CAMERA_NUMBERS, strict=True):
+        assert ops.camera_vjp(*scene_arguments(raw, camera._replace(lens=lens)), no_rows).shape == (1, numbers)
+    assert ops.sum_blocks(torch.tensor([[1.0, 2.0], [3.0, 5.0]]).double()).tolist() == [4.0, 7.0]
     for size, tiles in ((fakes.TILE, 1), (fakes.TILE + 1, 4)):
         assert len(ops.bin(splats, depths, rects, 0 * counts, size, size, False)[1]) == tiles + 1
-    drawn = draw(arguments, camera.bg)
-    rows = [ops.blend_rows(drawn.kept(camera.bg), drawn.color, absolute=absolute)[0] for absolute in (False, True)]
-    assert rows[0].shape[1] == fakes.MOMENT_VALUES and rows[1].shape[1] == fakes.MOMENT_VALUES + fakes.ABSOLUTE_VALUES
-    rows = [*drawn.kept(camera.bg)[:2], *ops.blend_rows(drawn.kept(camera.bg), drawn.color)]
-    lens = Lens("perspective", (9.0, 9.0), (8.0, 3.0))
-    scenes = arguments, scene_arguments(raw, camera._replace(lens=lens))
-    sums = [ops.camera_vjp(*scene, rows) for scene in scenes]
-    assert [values.shape for values in sums] == [(1, numbers) for numbers in fakes.CAMERA_NUMBERS]
     assert fakes.SLEEP_BLOCK == BLOCK
-    assert torch.equal(ops.sum_blocks(torch.cat([sums[0], 3 * sums[0]])), sums[0][0] + 3 * sums[0][0])
     rects, limits = torch.zeros(fakes.RECORD_BLOCK + 1, 4, dtype=torch.int32), torch.zeros(2, 3, dtype=torch.int32)
     for splats, blocks in ((fakes.RECORD_BLOCK, 1), (fakes.RECORD_BLOCK + 1, 2)):
         assert ops.list_records(rects[:splats], rects[:splats, 0], limits)[0].shape == (4, blocks)

@@ -46,21 +46,11 @@ def _rasterize(device: str, dtype: torch.dtype) -> Callable[[], Results]:
 
     def everything() -> Results:
         camera.viewmatrix.grad = None
-        return [*gradients(parameters, camera, device).values(), camera.viewmatrix.grad]
+        absolute = gradients(parameters, scene.settings(dtype), device, want_absolute_gradient=True)["d means2d"]
+        assert absolute[:, 2].any()
+        return [absolute, *gradients(parameters, camera, device).values(), camera.viewmatrix.grad]
 
     return everything
-
-
-def _absolute_gradients(device: str, dtype: torch.dtype) -> Callable[[], Results]:
-    scene = ordinary(4000, 203, 117)
-    parameters = {name: t.to(dtype) for name, t in scene.parameters.items()}
-
-    def lengths() -> Results:
-        got = gradients(parameters, scene.settings(dtype), device, want_absolute_gradient=True)["d means2d"]
-        assert got[:, 2].any()
-        return [got]
-
-    return lengths
 
 
 def _rows_of_gaussians(device: str, dtype: torch.dtype, count: int) -> tuple[Results, Tensor]:
@@ -170,8 +160,7 @@ def _distances(device: str, dtype: torch.dtype) -> Callable[[], Results]:
     return lambda: [distCUDA2(points)]
 
 
-WORK = [_rasterize, _absolute_gradients, _adam, _sparse_adam, _exchange, _gradient_rows, _gaussian_step, _ssim]
-WORK += [_distances, _density]
+WORK = [_rasterize, _adam, _sparse_adam, _exchange, _gradient_rows, _gaussian_step, _ssim, _distances, _density]
 
 
 @BOTH_AND_GPU

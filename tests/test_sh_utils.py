@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from diff_gaussian_rasterization.harmonics import sh_basis as gsplats_basis
 from diff_gaussian_rasterization.reference.colour import sh_basis as oracles_basis
 from scipy.special import sph_harm_y
 
@@ -23,12 +24,14 @@ def _real(l: int, m: int, theta: np.ndarray, phi: np.ndarray) -> np.ndarray:  # 
 
 
 def test_bases_are_scipys():
-    """Both bases: that of the reference's helpers, and that of the oracle, which takes directions of any length."""
+    """Compare the basis of the reference's helpers, of gsplat's function, and of the oracle, for rays of any length."""
     d = _directions(40)
     x, y, z = d.numpy().T
     theta, phi = np.arccos(z), np.arctan2(y, x)
-    wanted = np.stack([_real(l, m, theta, phi) for l in range(5) for m in range(-l, l + 1)], axis=-1)  # noqa: E741
-    np.testing.assert_allclose(sh_basis(4, d).numpy(), wanted, atol=1e-13)  # arccos near the poles loses some digits
+    wanted = np.stack([_real(l, m, theta, phi) for l in range(7) for m in range(-l, l + 1)], axis=-1)  # noqa: E741
+    np.testing.assert_allclose(gsplats_basis(6, d).numpy(), wanted, atol=1e-12)
+    # The arccos near the poles loses some digits.
+    np.testing.assert_allclose(sh_basis(4, d).numpy(), wanted[:, :25], atol=1e-13)
     np.testing.assert_allclose(oracles_basis(3.7 * d).numpy(), wanted[:, :16], rtol=0, atol=1e-13)
 
 

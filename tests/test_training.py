@@ -78,7 +78,8 @@ def test_every_view_once_an_epoch():
 
 def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, tmp_path, "--eval", "--test_iterations", "1", "300", iterations=300)
-    said = capfd.readouterr().out
+    said, shown = capfd.readouterr()
+    assert "Gaussians=300" in shown and "the model is worse" not in shown
     for line in (
         rf"Optimizing {tmp_path}",
         r"Number of points at initialisation :  300",
@@ -94,33 +95,30 @@ def test_learning_and_what_is_said(colmap_scene, tmp_path, capfd):
     assert log[1]["test_psnr"] > 16
 
 
-def test_sh_degree_rises_every_interval_up_to_its_maximum(colmap_scene, tmp_path, monkeypatch):
-    degree = 2
-    assert run.SH_INTERVAL == 1000
-    monkeypatch.setattr("splatting.run.SH_INTERVAL", 2)
-    every = range(1, 9)
-    _train(colmap_scene, tmp_path, "--sh_degree", degree, "--checkpoint_iterations", *every, iterations=8)
-    active = [load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][0] for t in every]
-    assert active == [min(t // 2, degree) for t in every]
-
-
-def test_a_training_of_less_than_an_interval_trains_all_sh_bands_in_the_same_share(colmap_scene, tmp_path, capsys):
-    every = range(1, 9)
-    _train(colmap_scene, tmp_path, "--checkpoint_iterations", *every, iterations=60)
-    assert [load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][0] for t in every] == [min(t // 2, 3) for t in every]
-    assert "their zeros" not in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
-    ("iterations", "said"), [(4, "; no SH band was trained"), (6, "; no SH band above degree 1 was")]
+    ("interval", "degree", "iterations", "said"),
+    [
+        (2, 2, 8, ""),
+        (1000, 3, 60, ""),  # a training of less than an interval trains all bands, in the same share
+        (4, 3, 4, "; no SH band was trained: 73"),
+        (4, 3, 6, "; no SH band above degree 1 was: 58"),
+    ],
 )
-def test_bands_that_were_never_trained_are_told_with_what_leaves_them_out(
-    colmap_scene, tmp_path, monkeypatch, capsys, iterations, said
+def test_sh_degree_rises_every_interval_up_to_its_maximum(
+    colmap_scene, tmp_path, monkeypatch, capsys, interval, degree, iterations, said
 ):
-    monkeypatch.setattr("splatting.run.SH_INTERVAL", 4)
-    _train(colmap_scene, tmp_path, iterations=iterations)
+    """Bands that were never trained are told, with what leaves them out."""
+    assert run.SH_INTERVAL == 1000
+    monkeypatch.setattr("splatting.run.SH_INTERVAL", interval)
+    every = range(1, min(iterations, 8) + 1)
+    words = "--sh_degree", degree, "--checkpoint_iterations", *every
+    _train(colmap_scene, tmp_path, *words, iterations=iterations)
+    active = [load_checkpoint(tmp_path / f"chkpnt{t}.pth")[0][0] for t in every]
+    assert active == [min(t // min(interval, 2 if interval > iterations else interval), degree) for t in every]
+    bands, _, share = said.partition(": ")
     printed = capsys.readouterr().out
-    assert said in printed and f"{73 if iterations == 4 else 58} % of it: --prune_sh 0 leaves them out" in printed
+    assert bands in printed and (f"{share} % of it: --prune_sh 0 leaves them out" in printed) == bool(said)
+    assert said or "their zeros" not in printed
 
 
 @pytest.mark.slow

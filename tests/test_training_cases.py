@@ -1,6 +1,5 @@
 """Edge cases of scenes: few, equal or stray points and cameras, tiny and huge worlds, map coordinates, one colour."""
 
-import argparse
 import json
 import sys
 from collections.abc import Callable
@@ -13,10 +12,9 @@ import torch
 from PIL import Image
 from plyfile import PlyData, PlyElement
 from simple_knn._C import distCUDA2
-from synthetic import FakeGaussians, make_colmap_scene
+from synthetic import FakeGaussians, make_colmap_scene, options_of
 
 import train
-from arguments import ModelParams
 from scene import Scene, export_world
 from scene.dataset_readers import read_scene
 from scene.gaussian_model import GaussianModel
@@ -201,7 +199,7 @@ def surveyed(tmp_path) -> tuple[Path, Path]:
     return scenes
 
 
-def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd):
+def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd, monkeypatch):
     """A scene without rounding: cameras along the axes, and all coordinates multiples of 1/1024."""
 
     def exact(model: pycolmap.Reconstruction) -> None:
@@ -224,38 +222,28 @@ def test_map_coordinates_change_no_byte_of_the_model(surveyed, tmp_path, capfd):
         assert (outs[0] / name).read_bytes() == (outs[1] / name).read_bytes()
     records = [json.loads((out / "model.json").read_text()) for out in outs]
     assert [record.get("world_offset") for record in records] == [None, list(UTM)]
-
-
-def test_views_are_shifted_by_the_offset_that_a_model_remembers(surveyed, tmp_path):
-    """Whatever offset would be found now."""
-    scene, out = surveyed[1], tmp_path / "out"
-    _train(scene, out, iterations=1)
-
-    def center() -> torch.Tensor:
-        return Scene(_options(scene, out), FakeGaussians(), -1, shuffle=False).getTrainCameras()[4].camera_center
-
-    found, remembered = center(), json.loads((out / "model.json").read_text())
-    (out / "model.json").write_text(json.dumps(remembered | {"world_offset": [0.0, 0.0, 7.0]}))
+    check_export(outs[1], tmp_path / "world.ply", monkeypatch)
+    found = center(surveyed[1], outs[1])
+    # Views are shifted by the offset that a model remembers, whatever offset would be found now.
+    (outs[1] / "model.json").write_text(json.dumps(records[1] | {"world_offset": [0.0, 0.0, 7.0]}))
     shift = torch.tensor(UTM) - torch.tensor([0, 0, 7.0])
-    torch.testing.assert_close(center() - found, shift, atol=0.5, rtol=0)  # float32
+    torch.testing.assert_close(center(surveyed[1], outs[1]) - found, shift, atol=0.5, rtol=0)  # float32
 
 
-def _options(scene: Path, out: Path) -> argparse.Namespace:
-    given = argparse.Namespace(source_path=str(scene), model_path=str(out))
-    return ModelParams(argparse.ArgumentParser()).extract(given)
+def center(scene: Path, out: Path) -> torch.Tensor:
+    return Scene(options_of(scene, out), FakeGaussians(), -1, shuffle=False).getTrainCameras()[4].camera_center
 
 
-def test_export_in_the_scenes_own_coordinates(surveyed, tmp_path, monkeypatch):
-    scene, out = surveyed[1], tmp_path / "out"
-    _train(scene, out, iterations=5)
-    monkeypatch.setattr(sys, "argv", ["export_world", str(out), str(tmp_path / "world.ply")])
+def check_export(out: Path, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check the export in the scene's own coordinates."""
+    monkeypatch.setattr(sys, "argv", ["export_world", str(out), str(world)])
     export_world.main()
-    exported, model = PlyData.read(tmp_path / "world.ply")["vertex"].data, PlyData.read(_ply(out, 5))["vertex"].data
+    exported, model = PlyData.read(world)["vertex"].data, PlyData.read(_ply(out, 100))["vertex"].data
     assert exported.dtype.names == model.dtype.names and exported.dtype["x"] == np.float64
     for name in model.dtype.names:
         distance = dict(zip("xyz", UTM, strict=True)).get(name, 0.0)
         np.testing.assert_array_equal(exported[name], model[name].astype(exported.dtype[name]) + distance)
-    monkeypatch.setattr(sys, "argv", ["export_world", str(out), str(_ply(out, 5))])
+    monkeypatch.setattr(sys, "argv", ["export_world", str(out), str(_ply(out, 100))])
     with pytest.raises(UserError, match="is the model itself"):
         export_world.main()
 

@@ -25,6 +25,8 @@ from splatting.iteration import Iteration
 Once = Callable[[str, Callable[[Path], object]], Path]
 ITERATIONS = 60
 EDGES = 19, 20, 29, 30, 33, 42, 59  # before and after changes of rows, a reset, and rests; before the last iteration
+LOOKS = ("--test_iterations", 3, 17, 31, 45, "--save_iterations", 9, 44)  # and checkpoints, between
+LOOKS += "--checkpoint_iterations", *EDGES, ITERATIONS
 LEARNT = "poses.json", "exposure.json", "appearance.json"
 MCMC = ("--strategy", "mcmc", "--mcmc_noise", 5e4, "--mcmc_init_opacity", 0.03, "--mcmc_min_opacity", 0.024)
 PYRAMID = "--schedule", Path(__file__).parent / "pyramid_60.json"  # small views at first
@@ -164,8 +166,8 @@ def shared_scene(once: Once) -> Path:
 
 
 def plain_training(once: Once, name: str) -> Path:
-    """The output folder of trained_as by plain steps, for all workers. It has the checkpoints of EDGES, too."""
-    words = "--plain_step", "--checkpoint_iterations", *EDGES, ITERATIONS
+    """The output folder of trained_as by plain steps, with LOOKS, for all workers."""
+    words = "--plain_step", *LOOKS
     if name == "asleep, degree 0":  # a checkpoint while blocks sleep gives f_rest, which has no values, a state of none
         words = words[:1]
     return once(f"plain/{name}", lambda out: trained_as(name, shared_scene(once), out, *words))

@@ -21,14 +21,9 @@ from utils.loss_utils import l1_loss, ssim
 
 class ModelOptions(ParamGroup):
     def __init__(self, parser, sentinel=False):
-        self.sh_degree = 3
-        self._source_path = ""
-        self._model_path = ""
-        self._images = "images"
-        self._resolution = -1
-        self._white_background = False
-        self.data_device = "cuda"
-        self.eval = False
+        self.sh_degree, self._resolution, self.data_device = 3, -1, "cuda"
+        self._source_path, self._model_path, self._images = "", "", "images"
+        self._white_background = self.eval = False
         super().__init__(parser, "Loading Parameters", sentinel)
 
     def extract(self, args):
@@ -39,30 +34,18 @@ class ModelOptions(ParamGroup):
 
 class PipelineOptions(ParamGroup):
     def __init__(self, parser):
-        self.convert_SHs_python = False
-        self.compute_cov3D_python = False
-        self.debug = False
+        self.convert_SHs_python = self.compute_cov3D_python = self.debug = False
         super().__init__(parser, "Pipeline Parameters")
 
 
 class OptimizationOptions(ParamGroup):
     def __init__(self, parser):
-        self.iterations = 30_000
-        self.position_lr_init = 0.00016
-        self.position_lr_final = 0.0000016
-        self.position_lr_delay_mult = 0.01
-        self.position_lr_max_steps = 30_000
-        self.feature_lr = 0.0025
-        self.opacity_lr = 0.05
-        self.scaling_lr = 0.005
-        self.rotation_lr = 0.001
-        self.percent_dense = 0.01
-        self.lambda_dssim = 0.2
-        self.densification_interval = 100
-        self.opacity_reset_interval = 3000
-        self.densify_from_iter = 500
-        self.densify_until_iter = 15_000
-        self.densify_grad_threshold = 0.0002
+        self.iterations = self.position_lr_max_steps = 30_000
+        self.position_lr_init, self.position_lr_final, self.position_lr_delay_mult = 0.00016, 0.0000016, 0.01
+        self.feature_lr, self.opacity_lr, self.scaling_lr, self.rotation_lr = 0.0025, 0.05, 0.005, 0.001
+        self.percent_dense, self.lambda_dssim, self.densify_grad_threshold = 0.01, 0.2, 0.0002
+        self.densification_interval, self.opacity_reset_interval = 100, 3000
+        self.densify_from_iter, self.densify_until_iter = 500, 15_000
         super().__init__(parser, "Optimization Parameters")
 
 
