@@ -178,13 +178,8 @@ def test_khronos_validator_accepts_glb(tmp_path, count):
     """The validator knows no attributes of the extension, and names each an invalid one; nothing else may be wrong."""
     path = written(tmp_path, ".glb", splats(count, 1))
     done = subprocess.run(["node", FOREIGN / "check_gltf.mjs", path], check=True, capture_output=True, text=True)
-    report = json.loads(done.stdout)
-    of_extension = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
-    wrong = [
-        message
-        for message in report["issues"]["messages"]
-        if message["severity"] < 2  # errors and warnings
-        and not (message["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and message["pointer"].startswith(of_extension))
-    ]
-    assert wrong == [] and not report["issues"]["truncated"]
-    assert report["info"]["totalVertexCount"] == count
+    report, known = json.loads(done.stdout), "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
+    for message in report["issues"]["messages"]:
+        if message["severity"] < 2:  # errors and warnings
+            assert message["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and message["pointer"].startswith(known)
+    assert not report["issues"]["truncated"] and report["info"]["totalVertexCount"] == count

@@ -18,23 +18,10 @@ import export
 import train
 from applications.demo.make_scene import make_scene
 from applications.export import html, mesh
+from applications.export import mesh_cleaning as cleaning
 from applications.export.formats import SceneInputs, find_format
-from applications.export.mesh import (
-    Mesh,
-    extract_zero_level,
-    fuse_volume,
-    make_mesh,
-    measure_surfaces,
-    reduce_triangles,
-    vertex_normals,
-)
-from applications.export.mesh_cleaning import (
-    find_rim_edges,
-    keep_large_parts,
-    keep_whole_parts,
-    smooth_rims,
-    trim_narrow_parts,
-)
+from applications.export.levels import join_splats
+from applications.export.mesh import Mesh, extract_zero_level, fuse_volume, make_mesh, measure_surfaces
 from applications.export.mesh_files import write_ply_mesh
 from applications.export.surfaces import Surfaces, make_pinholes
 from benchmarks.exports import mesh as benchmark
@@ -65,11 +52,6 @@ def shell(centre: np.ndarray, radius: float, count: int, color: tuple[float, flo
     return Splats(*(value.astype(np.float32) for value in values))
 
 
-def both(one: Splats, other: Splats) -> Splats:
-    names = ("means", "log_scales", "rotations", "opacity_logits", "sh")
-    return Splats(*(np.concatenate([getattr(one, name), getattr(other, name)]) for name in names))
-
-
 @pytest.fixture(scope="module")
 def ball() -> Splats:
     return shell(CENTRE, RADIUS, 6000, (0.9, 0.5, 0.1))
@@ -90,7 +72,9 @@ def test_the_median_depth_is_that_of_the_surface_in_front(views):
     view = views[0]
     veil = shell(CENTRE, 1.6 * RADIUS, 1500, (0.0, 0.0, 0.0))
     veil.opacity_logits[:] = -2.5
-    depth = surface_of(view, model_of(both(shell(CENTRE, RADIUS, 1500, (0.5, 0.5, 0.5)), veil)), pipeline()).depth
+    depth = surface_of(
+        view, model_of(join_splats([shell(CENTRE, RADIUS, 1500, (0.5, 0.5, 0.5)), veil])), pipeline()
+    ).depth
     distance = float(np.linalg.norm(view.camera_center.numpy() - CENTRE))
     height, width = depth.shape
     assert abs(float(depth[height // 2, width // 2]) - (distance - RADIUS)) < 0.05
@@ -114,25 +98,19 @@ def test_chunks_have_no_seams(ball, views, monkeypatch):
     for side in (16, 1):
         monkeypatch.setattr(mesh, "_CHUNK", side)
         vertices, faces, _ = extract_zero_level(volume, 3)
-        open_edges.append(len(find_rim_edges(faces, len(vertices))))
+        open_edges.append(len(cleaning.find_rim_edges(faces, len(vertices))))
         sizes.append((len(vertices), len(faces)))
     assert open_edges[0] == open_edges[1] and sizes[0] == sizes[1]
 
 
 def test_small_parts_are_left_out_and_large_ones_kept():
-    def strip(count: int, at: float) -> tuple[np.ndarray, np.ndarray]:
-        points = np.column_stack([np.arange(count + 2), np.arange(count + 2) % 2, np.full(count + 2, at)])
-        return points.astype(np.float32), np.arange(count)[:, None] + np.arange(3)
-
-    parts, faces, start = [], [], 0
-    for count, at in ((1, 5.0), (4000, 0.0), (4, 3.0), (3, 4.0)):
-        points, triangles = strip(count, at)
-        parts.append(points)
-        faces.append(triangles + start)
-        start += len(points)
-    vertices, faces = np.concatenate(parts), np.concatenate(faces).astype(np.int32)
+    counts, heights = np.array([1, 4000, 4, 3]), np.array([5.0, 0.0, 3.0, 4.0])  # triangles of strips
+    starts, numbers = np.cumsum(counts + 2) - counts - 2, np.concatenate([np.arange(count + 2) for count in counts])
+    vertices = np.column_stack([numbers, numbers % 2, np.repeat(heights, counts + 2)]).astype(np.float32)
+    firsts = np.concatenate([start + np.arange(count) for start, count in zip(starts, counts, strict=True)])
+    faces = (firsts[:, None] + np.arange(3)).astype(np.int32)
     weights = np.where(vertices[:, 2] == 3, 30, 1)  # which has more pixels in photos than its triangles tell
-    kept, left = keep_large_parts(vertices, faces, weights)
+    kept, left = cleaning.keep_large_parts(vertices, faces, weights)
     assert sorted(set(kept[:, 2])) == [0.0, 3.0] and len(left) == 4004
     assert left.max() == len(kept) - 1
 
@@ -148,22 +126,15 @@ def grid(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def test_rims_lose_their_tongues_and_become_smooth():
     vertices, faces = grid(20)
-    kept = trim_narrow_parts(faces, len(vertices))
+    kept = cleaning.trim_narrow_parts(faces, len(vertices))
     # The tongue may leave a stub, and corners become round.
     assert vertices[kept][..., 1].max() < 13 < vertices[faces][..., 1].max() and len(kept) > 0.9 * 2 * 200
     jagged = vertices.copy()
     jagged[:, 1] += np.where((vertices[:, 1] == 0) & (vertices[:, 0] % 2 == 0), 0.4, 0)
-    smooth = smooth_rims(jagged, faces)
+    smooth = cleaning.smooth_rims(jagged, faces)
     assert np.ptp(smooth[(vertices[:, 1] == 0) & (abs(vertices[:, 0] - 10) < 8), 1]) < 0.05
-    inner = np.setdiff1d(faces, find_rim_edges(faces, len(vertices)))
+    inner = np.setdiff1d(faces, cleaning.find_rim_edges(faces, len(vertices)))
     np.testing.assert_array_equal(smooth[inner], jagged[inner])
-
-
-def test_a_surface_needs_the_views_that_it_is_asked_for(ball, views):
-    volume = fuse_volume(Surfaces(ball, views[:2], pipeline()), VOXEL)
-    assert len(extract_zero_level(volume, 2)[1]) > 100
-    with pytest.raises(UserError, match="the training views show no surface"):
-        extract_zero_level(volume, 3)
 
 
 def sheets(count: int, points: int) -> tuple[np.ndarray, np.ndarray]:
@@ -176,24 +147,22 @@ def sheets(count: int, points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_fewer_triangles_lie_on_the_same_surface(of_ball):
-    vertices, faces = reduce_triangles(of_ball.vertices, of_ball.faces, 500)
+    vertices, faces = mesh.reduce_triangles(of_ball.vertices, of_ball.faces, 500)
     away = vertices - CENTRE
     distances = np.linalg.norm(away, axis=1)
     assert 400 < len(faces) <= 500 and abs(distances - RADIUS).mean() < 0.02
-    assert ((vertex_normals(vertices, faces) * away).sum(axis=1) / distances).min() > 0.8
+    assert ((mesh.vertex_normals(vertices, faces) * away).sum(axis=1) / distances).min() > 0.8
     whole = trimesh.creation.icosphere(3)
-    whole = np.float32(whole.vertices), np.int32(whole.faces)
     with pytest.raises(UserError, match="--triangles 1 leaves nothing of the mesh; give more"):
-        reduce_triangles(*whole, 1)
-    assert len(reduce_triangles(*sheets(40, 4), 100)[1]) <= 100
-    with pytest.raises(
-        UserError, match=r"--triangles 100 is too few for the rims of this mesh; give \d+ or more"
-    ) as too_few:
-        reduce_triangles(*sheets(200, 3), 100)
+        mesh.reduce_triangles(np.float32(whole.vertices), np.int32(whole.faces), 1)
+    assert len(mesh.reduce_triangles(*sheets(40, 4), 100)[1]) <= 100
+    said = r"--triangles 100 is too few for the rims of this mesh; give \d+ or more"
+    with pytest.raises(UserError, match=said) as too_few:
+        mesh.reduce_triangles(*sheets(200, 3), 100)
     most = int(str(too_few.value).split()[-3])
-    assert 100 < len(reduce_triangles(*sheets(200, 3), most)[1]) <= most
+    assert 100 < len(mesh.reduce_triangles(*sheets(200, 3), most)[1]) <= most
     with pytest.raises(UserError, match="all surfaces are too narrow for a mesh; give a smaller --voxel"):
-        keep_whole_parts(of_ball.vertices, of_ball.faces[:2], np.ones(len(of_ball.vertices)))
+        cleaning.keep_whole_parts(of_ball.vertices, of_ball.faces[:2], np.ones(len(of_ball.vertices)))
 
 
 def test_a_lens_gives_way_to_a_pinhole_in_its_place(tmp_path):
@@ -300,22 +269,27 @@ def test_too_small_voxels_are_refused_or_enlarged(ball, views, monkeypatch):
 
 
 def test_without_surfaces_there_is_no_mesh(ball, views):
-    ball.opacity_logits[:], before = -4.0, ball.opacity_logits.copy()
+    clear = replace(ball, opacity_logits=np.full(len(ball), -4.0, np.float32))
     with pytest.raises(UserError, match="no training view shows anything opaque"):
-        make_mesh(*measure_surfaces(ball, views, pipeline(), VOXEL))
-    ball.opacity_logits[:] = before
+        make_mesh(*measure_surfaces(clear, views, pipeline(), VOXEL))
     with pytest.raises(UserError, match="a mesh needs training cameras"):
         measure_surfaces(ball, [], pipeline(), VOXEL)
+    volume = fuse_volume(Surfaces(ball, views[:2], pipeline()), VOXEL)
+    assert len(extract_zero_level(volume, 2)[1]) > 100
+    with pytest.raises(UserError, match="the training views show no surface"):
+        extract_zero_level(volume, 3)
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory) -> Path:
+def trained(once) -> Path:
     """A short training of the traced scene."""
-    folder = tmp_path_factory.mktemp("mesh")
-    make_scene(folder / "scene", 12, 96, 72, 1500, 0)
-    words = "--iterations 300 --disable_viewer --test_iterations -1 --quiet --densify_from_iter 100"
-    train.main(["-s", str(folder / "scene"), "-m", str(folder / "model"), *words.split()])
-    return folder / "model"
+
+    def make(folder: Path) -> None:
+        make_scene(folder / "scene", 12, 96, 72, 1500, 0)
+        words = "--iterations 300 --disable_viewer --test_iterations -1 --quiet --densify_from_iter 100"
+        train.main(["-s", str(folder / "scene"), "-m", str(folder / "model"), *words.split()])
+
+    return once("mesh", make) / "model"
 
 
 @pytest.mark.slow
@@ -344,28 +318,7 @@ def test_files_of_one_call_share_what_is_slow(ball, views, tmp_path, monkeypatch
 
 
 @pytest.mark.slow
-def test_export_writes_meshes(trained, monkeypatch, tmp_path, capsys):
-    for name in ("mesh.ply", "room.mesh.glb"):
-        monkeypatch.setattr(
-            "sys.argv", ["export.py", "-m", str(trained), "--to", str(tmp_path / name), "--voxel", "0.1"]
-        )
-        export.main()
-        assert "triangles, " in capsys.readouterr().out and (tmp_path / name).stat().st_size > 10_000
-    for words, said in (
-        (
-            ["--to", "a.ply", "--voxel", "0.1"],
-            "--voxel is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz; leave it out",
-        ),
-        (["--to", "a.ply", "--triangles", "900"], "--triangles is for mesh.ply or mesh.glb or mesh.obj or mesh.usdz"),
-        (["--to", "mesh.ply", "--triangles", "0"], "--triangles must be 100 or above, got 0"),
-        (["--to", "mesh.ply", "--path", "spiral"], "--path is for .html; leave it out"),
-        (["--to", "mesh.ply", "--voxel", "0"], "--voxel must be above 0, got 0.0"),
-    ):
-        monkeypatch.setattr("sys.argv", ["export.py", "-m", str(trained), *words])
-        with pytest.raises(UserError, match=said):
-            export.main()
-
-
-def test_meshes_have_names_of_their_own():
-    assert find_format("out/mesh.ply").options == find_format("room.MESH.glb").options == ("voxel", "triangles")
-    assert find_format("out/meshes.ply").options == ()
+def test_export_writes_meshes(trained, tmp_path, run_export, capsys):
+    files = [tmp_path / "mesh.ply", tmp_path / "room.mesh.glb"]
+    run_export("-m", trained, "--to", files[0], "--to", files[1], "--voxel", 0.1)
+    assert capsys.readouterr().out.count("triangles, ") == 2 and min(file.stat().st_size for file in files) > 10_000

@@ -4,7 +4,6 @@ import argparse
 import json
 import math
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,8 +15,8 @@ from html_scene import FOV, SIZE, balls
 from html_scene import cameras as free_cameras
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
+from small_splats import read_glb
 
-import export
 import train
 from applications.export.formats import SceneInputs, find_format
 from applications.export.html import write_html
@@ -37,6 +36,7 @@ from utils.system_utils import UserError
 
 TURN = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
 SOME = Similarity(TURN, 2.5, np.array([3.0, -1.0, 0.5]))
+RECORD = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
 
 
 def cameras() -> list[Camera]:
@@ -89,22 +89,17 @@ def _args(folder: Path | str, upright=False, no_upright=False) -> argparse.Names
 
 
 def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path):
-    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
-    (tmp_path / "model.json").write_text(json.dumps({"similarity": record, "world_offset": [1.0, 2.0, 3.0]}))
+    (tmp_path / "model.json").write_text(json.dumps({"similarity": RECORD, "world_offset": [1.0, 2.0, 3.0]}))
     splats = replace(balls(), world_offset=(1.0, 2.0, 3.0))
     moved = SOME.transform(splats.means.astype(np.float64) + [1.0, 2.0, 3.0])
-    for of_scene, options, is_moved in (
-        (True, {}, True),
-        (True, {"no_upright": True}, False),
-        (False, {}, False),
-        (False, {"upright": True}, True),
-    ):
+    for of_scene, options, expected in (
+        (True, {}, moved), (True, {"no_upright": True}, splats.means),
+        (False, {}, splats.means), (False, {"upright": True}, moved),
+    ):  # fmt: skip
         found, _ = move_upright(_args(tmp_path, **options), of_scene, splats, None)
-        np.testing.assert_allclose(found.means, moved if is_moved else splats.means, atol=1e-5)
+        np.testing.assert_allclose(found.means, expected, atol=1e-5)
     check_upright(_args(tmp_path, upright=True))
-    with pytest.raises(UserError, match="contradict"):
-        check_upright(_args(tmp_path, True, True))
-    unknown = record | {"vertical": None, "rotation": np.eye(3).tolist()}
+    unknown = RECORD | {"vertical": None, "rotation": np.eye(3).tolist()}
     (tmp_path / "model.json").write_text(json.dumps({"similarity": unknown}))
     with pytest.raises(UserError, match="found no vertical"):
         check_upright(_args(tmp_path, upright=True))
@@ -112,19 +107,15 @@ def test_pages_and_meshes_are_upright_by_default_and_others_on_request(tmp_path)
     assert not move_inputs(around(), found).upright and move_inputs(around(), SOME).upright
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        *({"scale": value} for value in (1e300, 1e-300, 0, -1, 10**400)),
-        *({"translation": value} for value in ([1e300, 0, 0], [[1], [1, 2]])),
-        {"rotation": [[1], [1, 2]]},
-        {"latitude": 1e300, "longitude": 0, "height": 0},
-    ],
-)
+@pytest.mark.parametrize("change", [
+    *({"scale": value} for value in (1e300, 1e-300, 0, -1, 10**400)),
+    *({"translation": value} for value in ([1e300, 0, 0], [[1], [1, 2]], [0, 0, None])),
+    {"rotation": [[1], [1, 2]]},
+    {"latitude": 1e300, "longitude": 0, "height": 0},
+])  # fmt: skip
 def test_a_similarity_that_leaves_no_scene_is_refused(tmp_path, change):
-    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5], **change}
-    (tmp_path / "model.json").write_text(json.dumps({"similarity": record}))
-    (tmp_path / "orientation.json").write_text(json.dumps(record))
+    for name, content in (("model.json", {"similarity": RECORD | change}), ("orientation.json", RECORD | change)):
+        (tmp_path / name).write_text(json.dumps(content))
     for read in (lambda: move_upright(_args(tmp_path), True, balls(), None), lambda: read_orientation(tmp_path)):
         with pytest.raises(UserError, match="no rotation, scale and translation of a similarity that a scene may"):
             read()
@@ -135,40 +126,26 @@ def _trained(scene: Path, out: Path) -> Path:
     return out
 
 
-def test_a_training_keeps_the_similarity_for_exports(colmap_scene, tmp_path, monkeypatch):
-    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5], "unit": "metre"}
-    (colmap_scene / "orientation.json").write_text(json.dumps(record))
-    model = _trained(colmap_scene, tmp_path / "model")
-    assert read_model_json(model)["similarity"] == record
-    for name, more in (("plain", []), ("upright", ["--upright"])):
-        monkeypatch.setattr(sys, "argv", ["export.py", "-m", str(model), "--to", str(tmp_path / f"{name}.ply"), *more])
-        export.main()
-    plain, upright = (read_splats(tmp_path / f"{name}.ply") for name in ("plain", "upright"))
-    np.testing.assert_allclose(upright.means, SOME.transform(plain.means), atol=1e-5)
-    monkeypatch.setattr(export, "load", lambda *_: pytest.fail("this is refused before anything is loaded"))
-    monkeypatch.setattr(sys, "argv", [*sys.argv, "--no_upright"])
-    with pytest.raises(UserError, match="contradict"):
-        export.main()
-    (colmap_scene / "orientation.json").unlink()
-    assert "similarity" not in read_model_json(_trained(colmap_scene, tmp_path / "other"))
-
-
-def test_a_scene_that_is_oriented_after_the_training_orients_exports(colmap_scene, tmp_path, monkeypatch, capsys):
+def test_exports_are_oriented_as_the_scene_was_at_the_training_or_later(colmap_scene, tmp_path, run_export, capsys):
+    """The last export is of a scene that has got other poses since."""
     model, written = _trained(colmap_scene, tmp_path / "model"), []
-    record = {"rotation": TURN.tolist(), "scale": 2.5, "translation": [3.0, -1.0, 0.5]}
+    assert "similarity" not in read_model_json(model)
     for name in ("plain", "upright"):
-        words = ["-m", str(model), "--to", str(tmp_path / f"{name}.ply"), *(["--upright"] if written else [])]
-        monkeypatch.setattr(sys, "argv", ["export.py", *words])
-        export.main()
+        run_export("-m", model, "--to", tmp_path / f"{name}.ply", *(["--upright"] if written else []))
         written.append(read_splats(tmp_path / f"{name}.ply").means)
-        (colmap_scene / "orientation.json").write_text(json.dumps(record))
+        (colmap_scene / "orientation.json").write_text(json.dumps(RECORD | {"unit": "metre"}))
     np.testing.assert_allclose(written[1], SOME.transform(written[0]), atol=1e-5)
+    assert read_model_json(_trained(colmap_scene, tmp_path / "other"))["similarity"] == RECORD | {"unit": "metre"}
+    (colmap_scene / "orientation.json").unlink()
+    run_export("-m", tmp_path / "other", "--to", tmp_path / "kept.ply", "--upright")
+    np.testing.assert_allclose(read_splats(tmp_path / "kept.ply").means, written[1], atol=1e-5)
     assert "poses are not those" not in capsys.readouterr().err
-    record = json.loads((model / "cameras.json").read_text())
-    for entry in record:  # as if the scene had got other poses since
+    poses = json.loads((model / "cameras.json").read_text())
+    for entry in poses:
         entry["position"][0] += 0.5
-    (model / "cameras.json").write_text(json.dumps(record))
-    export.main()
+    (model / "cameras.json").write_text(json.dumps(poses))
+    (colmap_scene / "orientation.json").write_text(json.dumps(RECORD))
+    run_export("-m", model, "--to", tmp_path / "upright.ply", "--upright")
     assert "poses are not those" in capsys.readouterr().err
 
 
@@ -184,21 +161,15 @@ def test_glb_tells_where_on_earth_it_is(tmp_path, place, kind):
     """-x of the turned node is east, y up, z north (README of EXT_georeference); x, y, z were east, down, north."""
     splats = replace(move_splats(balls(), replace(SOME, place=place)), world_offset=(0.0, 0.0, 0.0))
     if kind == "mesh":
-        triangle = textured(np.eye(3, dtype=np.float32))
-        write_glb_mesh(tmp_path / "x.glb", triangle, splats)
+        write_glb_mesh(tmp_path / "x.glb", textured(np.eye(3, dtype=np.float32)), splats)
     else:
         write_glb(tmp_path / "x.glb", splats)
-    content = (tmp_path / "x.glb").read_bytes()
-    document = json.loads(content[20 : 20 + int.from_bytes(content[12:16], "little")])
+    document, _ = read_glb(tmp_path / "x.glb")
     (node,) = document["nodes"]
+    expected = {"EXT_georeference": {"latitude": 47.25, "longitude": 8.5}} if place else {}
+    assert node.get("extensions", {}) == expected and ("EXT_georeference" in document["extensionsUsed"]) == bool(place)
     turn = Rotation.from_quat(node["rotation"]).as_matrix()
-    if not place:
-        assert "EXT_georeference" not in document["extensionsUsed"] and "extensions" not in node
-        np.testing.assert_allclose(turn, np.diag([1, -1, -1]), atol=1e-9)
-    else:
-        assert "EXT_georeference" in document["extensionsUsed"]
-        assert node["extensions"] == {"EXT_georeference": {"latitude": 47.25, "longitude": 8.5}}
-        np.testing.assert_allclose(turn, np.diag([-1, -1, 1]), atol=1e-9)
+    np.testing.assert_allclose(turn, np.diag([-1, -1, 1] if place else [1, -1, -1]), atol=1e-9)
 
 
 @pytest.mark.parametrize("upright", [True, False])
@@ -215,9 +186,7 @@ def test_a_ply_of_an_upright_mesh_has_z_up(tmp_path, monkeypatch, upright):
             read = PlyData.read(path)["vertex"]
             found = np.column_stack([read[name] for name in "xyz"])
         else:  # its node turns it
-            content = path.read_bytes()
-            start = 28 + int.from_bytes(content[12:16], "little")
-            found = np.frombuffer(content, "<f4", 9, start).reshape(3, 3)
+            found = np.frombuffer(read_glb(path)[1], "<f4", 9).reshape(3, 3)
         np.testing.assert_array_equal(found, expected)
 
 

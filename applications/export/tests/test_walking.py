@@ -48,10 +48,8 @@ def test_an_octree_has_the_voxels_that_it_was_made_of():
     tried = np.concatenate([voxels, every[rng.choice(len(every), 3000, replace=False)]])
     there = {tuple(voxel) for voxel in voxels.tolist()}
     assert solid_at(encode_octree(voxels, 0.1), 0.1 * tried) == [tuple(voxel) in there for voxel in tried.tolist()]
-    assert solid_at(encode_octree(np.array([[3, 4, 5]]), 0.1), np.array([[0.3, 0.4, 0.5], [0.5, 0.4, 0.5]])) == [
-        True,
-        False,
-    ]
+    one = encode_octree(np.array([[3, 4, 5]]), 0.1)
+    assert solid_at(one, np.array([[0.3, 0.4, 0.5], [0.5, 0.4, 0.5]])) == [True, False]
 
 
 def test_a_room_is_solid_at_its_walls_floor_and_step_alone():
@@ -65,10 +63,8 @@ def test_a_room_is_solid_at_its_walls_floor_and_step_alone():
 def test_nobody_walks_where_photos_show_a_small_thing(capsys):
     small = Similarity(np.eye(3), 0.5, np.zeros(3))  # 3 metres wide
     assert make_solid(move_splats(room(), small), cameras(unit=0.5), pipeline()) is None
-    said = capsys.readouterr().out
-    assert re.search(
-        r"the photos show 3\.\d x 3\.\d metres, too small to walk in; guests can walk in 5 x 5 or more", said
-    )
+    said = r"the photos show 3\.\d x 3\.\d metres, too small to walk in; guests can walk in 5 x 5 or more"
+    assert re.search(said, capsys.readouterr().out)
 
 
 def test_cameras_of_an_unknown_unit_stand_at_the_height_of_eyes():

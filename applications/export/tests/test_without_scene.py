@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +39,16 @@ def test_all_views_of_the_circle_show_the_model():
     assert len(empty) == COUNT and np.isfinite(empty[0].T).all()
 
 
-def test_recorded_poses_are_those_of_the_record(tmp_path):
-    record = tmp_path / "cameras.json"
-    cameras = circle_cameras(balls().means)
+def _recorded(cameras: list) -> list[dict]:
+    """The cameras as a training records them."""
     for camera in cameras:
         camera.width, camera.height = camera.image_width, camera.image_height
-    record.write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(cameras)]))
+    return [camera_to_JSON(number, camera) for number, camera in enumerate(cameras)]
+
+
+def test_recorded_poses_are_those_of_the_record(tmp_path):
+    record, cameras = tmp_path / "cameras.json", circle_cameras(balls().means)
+    record.write_text(json.dumps(_recorded(cameras)))
     for one, other in zip(recorded_cameras(record), cameras, strict=True):
         assert one.image_name == other.image_name
         torch.testing.assert_close(one.full_proj_transform, other.full_proj_transform, rtol=0, atol=1e-5)
@@ -52,35 +57,21 @@ def test_recorded_poses_are_those_of_the_record(tmp_path):
         recorded_cameras(record)
 
 
-def test_a_viewer_begins_at_the_circle(tmp_path):
-    path, options = written(tmp_path, ".splat", balls()), pipeline()
-    scene = view.load_file(str(path), options)
-    assert scene.loaded_iter == path.name and len(scene.gaussians) == len(balls())
-    shown = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
-    assert len(shown.by_name) == COUNT and np.allclose(shown.up, [0, -1, 0], atol=1e-6)
-    antialiased = written(tmp_path, ".ply", balls().__class__(**(vars(balls()) | {"antialiasing": True})))
-    view.load_file(str(antialiased), options)
-    assert options.antialiasing
-
-
 def test_poses_that_moved_since_the_training_are_told(tmp_path):
     record, cameras = tmp_path / "cameras.json", circle_cameras(balls().means)
-    for camera in cameras:
-        camera.width, camera.height = camera.image_width, camera.image_height
     assert not have_moved(tmp_path, cameras)  # as there is none
     for step, moved in ((0.0, False), (1e-6, False), (0.03, True)):
-        entries = [camera_to_JSON(number, camera) for number, camera in enumerate(cameras)]
+        entries = _recorded(cameras)
         for entry in entries:
-            entry["position"] = [entry["position"][0] + step * COUNT, *entry["position"][1:]]
+            entry["position"][0] += step * COUNT
         record.write_text(json.dumps(entries))
         assert have_moved(tmp_path, cameras[:8]) == moved
+    for content in ([entry | {"img_name": "other"} for entry in entries], [{}]):
+        record.write_text(json.dumps(content))
+        assert not have_moved(tmp_path, cameras)
+    record.write_text(json.dumps(entries))
     (tmp_path / "poses.json").touch()
     assert not have_moved(tmp_path, cameras)  # which are corrected
-    (tmp_path / "poses.json").unlink()
-    record.write_text(json.dumps([entry | {"img_name": "other"} for entry in entries]))
-    assert not have_moved(tmp_path, cameras)
-    record.write_text("[{}]")
-    assert not have_moved(tmp_path, cameras)
 
 
 @pytest.fixture
@@ -90,10 +81,7 @@ def gone(tmp_path) -> Path:
     (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
     written(tmp_path, ".ply", splats).rename(tmp_path / "point_cloud/iteration_7/point_cloud.ply")
     (tmp_path / "cfg_args").write_text(f"Namespace(sh_degree=1, source_path='{tmp_path}/gone', white_background=False)")
-    cameras = circle_cameras(splats.means)
-    for camera in cameras:
-        camera.width, camera.height = camera.image_width, camera.image_height
-    (tmp_path / "cameras.json").write_text(json.dumps([camera_to_JSON(n, camera) for n, camera in enumerate(cameras)]))
+    (tmp_path / "cameras.json").write_text(json.dumps(_recorded(circle_cameras(splats.means))))
     return tmp_path
 
 
@@ -107,62 +95,47 @@ def test_a_folder_whose_scene_is_gone_keeps_its_poses(gone, capsys):
         view.find_kept(scene, argparse.Namespace(clean=0.05), pipeline(), options)
 
 
-def test_every_format_of_a_folder_whose_scene_is_gone(gone, monkeypatch, capsys):
+def test_every_format_of_a_folder_whose_scene_is_gone(gone, monkeypatch, run_export, capsys):
     """In one call, which reads the model once. Those that a program of others writes are not tried."""
     reads, endings = [], [entry.ending for entry in FORMATS if entry.ending not in (".sog", "lod-meta.json")]
     monkeypatch.setattr(export, "read_model", lambda path: reads.append(path) or read_model(path))
     files = [gone / f"{number}{ending}" for number, ending in enumerate(endings)]
-    words = [word for file in files for word in ("--to", str(file))]
-    shared = ["export.py", "-m", str(gone), "-r", "8", "--max_splats", "400", "--voxel", "0.1", "--start", "around 3"]
-    monkeypatch.setattr("sys.argv", [*shared, *words])
-    export.main()
+    words = ["-r", "8", "--max_splats", "400", "--voxel", "0.1", "--start"]
+    run_export("-m", gone, *words, "around 3", *(word for file in files for word in ("--to", file)))
     said = capsys.readouterr()
     assert len(reads) == 1 and said.out.count("600 -> 400 Gaussians: no score, as the photos are gone;") == 1
     assert said.err.count("gone is gone, so there are poses, but no photos") == 1
     assert f"not cleaned, as there is no scene folder {gone}/gone; name it with -s" in said.err
-    for file in files:
-        assert file.stat().st_size and f"Wrote {file}: " in said.out
+    assert all(file.stat().st_size and f"Wrote {file}: " in said.out for file in files)
     assert len(read_splats(files[endings.index(".ply")])) == 400
     assert "View 10 of 10" in files[-1].read_text(encoding="utf-8")
     for need in ("--clean", "--upright"):
-        monkeypatch.setattr("sys.argv", ["export.py", "-m", str(gone), "--to", str(gone / "a.ply"), need])
         with pytest.raises(UserError, match="no scene folder .*gone; name|--upright needs a model folder"):
-            export.main()
+            run_export("-m", gone, "--to", gone / "a.ply", need)
 
 
-def test_export_takes_a_file_alone(tmp_path, monkeypatch):
-    path = written(tmp_path, ".splat", balls())
-
-    def run(*words: str) -> None:
-        monkeypatch.setattr("sys.argv", ["export.py", *words])
-        export.main()
-
-    run(str(path), "--to", str(tmp_path / "out.ply"))
+def test_a_file_alone_is_exported_and_shown(tmp_path, run_export):
+    path, options = written(tmp_path, ".splat", balls()), pipeline()
+    run_export(path, "--to", tmp_path / "out.ply")
     np.testing.assert_array_equal(read_splats(tmp_path / "out.ply").means, read_splats(path).means)
-    run(str(path), "--to", str(tmp_path / "page.html"), "--path", "ellipse")
+    run_export(path, "--to", tmp_path / "page.html", "--path", "ellipse")
     assert "View 10 of 10" in (tmp_path / "page.html").read_text(encoding="utf-8")
-    for words, said in (
-        (["--max_splats", "10", "--to", "a.ply"], "--max_splats, --clean, --walk and meshes need training views"),
-        (["--to", "mesh.ply"], "--max_splats, --clean, --walk and meshes need training views"),
-        (["-m", str(tmp_path), "--to", "a.ply"], "stands alone; beside -m or --ply, give one file by --ply"),
-    ):
-        with pytest.raises(UserError, match=said):
-            run(str(path), *words)
+    scene = view.load_file(str(path), options)
+    assert scene.loaded_iter == path.name and len(scene.gaussians) == len(balls())
+    shown = SceneCameras(scene.getTrainCameras(), scene.getTestCameras())
+    assert len(shown.by_name) == COUNT and np.allclose(shown.up, [0, -1, 0], atol=1e-6)
+    view.load_file(str(written(tmp_path, ".ply", replace(balls(), antialiasing=True))), options)
+    assert options.antialiasing
 
 
 def test_a_sog_needs_its_program(tmp_path, monkeypatch):
+    program, answer = tmp_path / "program", None
     (tmp_path / "a.sog").write_bytes(b"PK")
-    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    monkeypatch.setattr("shutil.which", lambda *_, **__: answer)
     with pytest.raises(UserError, match="a.sog needs splat-transform; install Node"):
         read_any(tmp_path / "a.sog")
-    _stand_in(tmp_path, monkeypatch, "echo Reading; echo ✗ Error: no model >&2; echo failed in 1 s; exit 1")
+    program.write_text("#!/bin/sh\necho Reading; echo ✗ Error: no model >&2; echo failed in 1 s; exit 1\n")
+    program.chmod(0o755)
+    answer = str(program)
     with pytest.raises(UserError, match=r"a.sog is not read by .*program .Error: no model.; save or download it again"):
         read_any(tmp_path / "a.sog")
-
-
-def _stand_in(folder: Path, monkeypatch, script: str) -> None:
-    """A program in the place of splat-transform. It gets its output as its last argument."""
-    program = folder / "program"
-    program.write_text(f"#!/bin/sh\n{script}\n")
-    program.chmod(0o755)
-    monkeypatch.setattr("shutil.which", lambda *_, **__: str(program))
