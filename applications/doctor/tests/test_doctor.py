@@ -120,34 +120,27 @@ def test_cameras_that_stand_or_look_oddly(info):
         scaled = _with_cameras(info, lambda _, camera, f=factor: {"T": camera.T * f}, info.extent * factor)
         assert remedy in problems(check_extent(scaled))[0]
     name = info.train_cameras[3].image_name
-    (line,) = _said(check_cameras(_with_cameras(info, lambda i, c: {"T": c.T + 200 * (i == 3)}, 50.0)))
-    assert f"1 of 17 cameras are more than 10 times as far from the middle as the median camera ({name})" in line
-    (line,) = _said(check_cameras(_with_cameras(info, lambda _, c: {"T": -c.R.T @ np.ones(3)})))
-    assert "all cameras stand in one place" in line
+    far = f"1 of 17 cameras are more than 10 times as far from the middle as the median camera ({name})"
+    for change, extent, said in (
+        (lambda i, c: {"T": c.T + 200 * (i == 3)}, 50.0, far),
+        (lambda _, c: {"T": -c.R.T @ np.ones(3)}, None, "all cameras stand in one place"),
+    ):
+        (line,) = map(str, check_cameras(_with_cameras(info, change, extent)))
+        assert said in line
 
 
-@pytest.mark.parametrize(
-    ("change", "text"),
-    [
-        (lambda pose: pose, ""),
-        (np.linalg.inv, "all cameras stand in one place, so depth cannot be found; check the scale, and whether poses"),
-        (
-            lambda pose: pose * [1, -1, -1, 1],
-            "the cameras stand around a place and look away from it; check the scale,",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("change", "text"), [
+    (lambda pose: pose, ""),
+    (np.linalg.inv, "all cameras stand in one place, so depth cannot be found; check the scale, and whether poses"),
+    (lambda pose: pose * [1, -1, -1, 1], "the cameras stand around a place and look away from it; check the scale,"),
+])  # fmt: skip
 def test_poses_of_another_form_without_points(blender_scene, change, text):
     for file in blender_scene.glob("transforms_*.json"):
         edit_json(file, lambda content: [f.update(transform_matrix=change(np.array(f["transform_matrix"])).tolist())
                                          for f in content["frames"]])  # fmt: skip
     found = read_scene(blender_scene, "images", hold_out=False)
-    said = [*_said(check_cameras(found)), *problems(check_extent(found))]
+    said = [*map(str, check_cameras(found)), *problems(check_extent(found))]
     assert [line[: len(text)] for line in said] == [text] * bool(text)
-
-
-def _said(found) -> list[str]:
-    return [str(one) for one in found]
 
 
 def _with_cloud(info, points: np.ndarray):
@@ -156,23 +149,23 @@ def _with_cloud(info, points: np.ndarray):
 
 def test_points_and_cameras_that_do_not_meet(info):
     many = np.random.default_rng(0).normal(scale=0.2, size=(2000, 3)).astype(np.float32)
-    assert _said(check_points(_with_cloud(info, many))) == []
     half_turn = np.diag([-1.0, 1.0, -1.0])
-    turned = lambda camera: {"R": camera.R @ half_turn, "T": half_turn @ camera.T}  # noqa: E731
-    away = _with_cloud(_with_cameras(info, lambda _, camera: turned(camera)), many)
-    assert (
-        "100% of the points are in no photo: poses and points do not belong together; check the scale, and "
-        in (_said(check_points(away))[0])
-    )
-    assert _said(check_points(dataclasses.replace(away, has_random_points=True))) == []
-    few = _with_cloud(_with_cameras(info, lambda i, camera: turned(camera) if i % 4 == 0 else {}), many)
-    assert "5 cameras have hardly any point in view" in (line := _said(check_points(few))[0]) and "remove" not in line
-    one = _with_cloud(_with_cameras(info, lambda i, camera: {} if i else turned(camera)), many)
+
+    def said(points, turned=(), **change) -> str:
+        """What is said where the cameras of these numbers look away."""
+        turn = lambda i, c: {"R": c.R @ half_turn, "T": half_turn @ c.T} if i in turned else {}  # noqa: E731
+        scene = dataclasses.replace(_with_cloud(_with_cameras(info, turn), points), **change)
+        return " ".join(map(str, check_points(scene)))
+
+    away = "100% of the points are in no photo: poses and points do not belong together; check the scale, and "
+    assert said(many) == said(many, range(17), has_random_points=True) == "" and away in said(many, range(17))
+    few = said(many, range(0, 17, 4))
+    assert "5 cameras have hardly any point in view" in few and "remove" not in few
     name = info.train_cameras[0].image_name
-    assert f"1 cameras have hardly any point in view ({name})" in _said(check_points(one))[0]
+    assert f"1 cameras have hardly any point in view ({name})" in said(many, [0])
     far = many.copy()
     far[::20] = 1e5
-    assert "5.0% of the points are more than 100 extents away" in _said(check_points(_with_cloud(info, far)))[0]
+    assert "5.0% of the points are more than 100 extents away" in said(far)
 
 
 def test_what_readers_say_becomes_a_line(colmap_scene, tmp_path):
@@ -198,22 +191,20 @@ def test_poses_that_tracks_correct(colmap_scene, tmp_path):
 
 def test_what_convert_noted(colmap_scene):
     advice = ["13 of 30 photos were left out; take more photos between them"]
-    report = {"registered": 17, "photos": 30, "advice": advice}
-    path = colmap_scene / "convert_report.json"
-    path.write_text(json.dumps(report))
-    said = problems(check_dataset(str(colmap_scene), "images"))
-    assert "PROBLEM only 17 of 30 photos were placed by convert.py -> take more photos between them" in said
-    path.write_text("{")
-    assert "convert_report.json is damaged" in str(problems(check_dataset(str(colmap_scene), "images")))
+    for content, said in (
+        (json.dumps({"registered": 17, "photos": 30, "advice": advice}),
+         "only 17 of 30 photos were placed by convert.py -> take more photos between them"),
+        ("{", "convert_report.json is damaged"),
+    ):  # fmt: skip
+        (colmap_scene / "convert_report.json").write_text(content)
+        assert said in str(problems(check_dataset(str(colmap_scene), "images")))
 
 
 @pytest.fixture
 def model(colmap_scene, tmp_path):
     """A function that writes a model of the synthetic scene with changed Gaussians and returns the folder."""
 
-    def write(
-        change=lambda _: None, iteration: int = 7, source: Path = colmap_scene, cloud: Path = colmap_scene
-    ) -> str:
+    def write(change=lambda _: None, iteration=7, source: Path = colmap_scene, cloud: Path = colmap_scene) -> str:
         folder = tmp_path / "model"
         given = argparse.Namespace(source_path=str(source), model_path=str(folder))
         write_cfg_args(folder, ModelParams(argparse.ArgumentParser()).extract(given))
@@ -233,16 +224,13 @@ def filled(**columns: float):
     return lambda gaussians: [getattr(gaussians, f"_{name}").fill_(value) for name, value in columns.items()]
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (lambda gaussians: gaussians._scaling[5, 1].fill_(np.nan),
-         "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
-        (filled(opacity=-7), "renders of the training views are black -> the dataset has problems (only 17 photos): "),
-        (filled(opacity=3, features_dc=-5), "renders of the training views are black -> "),
-        (lambda gaussians: gaussians._xyz.add_(500), "renders of the training views are black -> "),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("change", "said"), [
+    (lambda gaussians: gaussians._scaling[5, 1].fill_(np.nan),
+     "1 of 300 Gaussians have a scale that is not finite -> resume from an earlier checkpoint"),
+    (filled(opacity=-7), "renders of the training views are black -> the dataset has problems (only 17 photos): "),
+    (filled(opacity=3, features_dc=-5), "renders of the training views are black -> "),
+    (lambda gaussians: gaussians._xyz.add_(500), "renders of the training views are black -> "),
+])  # fmt: skip
 def test_models_with_a_fault(model, change, said):
     found = problems(check_model(model(change, iteration=2000), -1))
     assert any(said in text for text in found)
