@@ -63,10 +63,10 @@ def test_pycolmap_reads_a_valid_model(model, scene):
 def test_same_seed_same_bytes_and_another_seed_another_scene(tmp_path, monkeypatch):
     """Also by other processes."""
     folders = [tmp_path / name for name in "abc"]
-    for folder, seed in zip(folders, (5, 5, 6), strict=True):
+    monkeypatch.setattr(maker, "PIXELS_PER_PROCESS", 24 * 18)
+    for folder, seed, cores in zip(folders, (5, 5, 6), (1, 2, 1), strict=True):
+        monkeypatch.setattr(maker, "cores", lambda cores=cores: cores)
         make_scene(folder, 3, 24, 18, 60, seed)
-        monkeypatch.setattr(maker, "PIXELS_PER_PROCESS", 24 * 18)
-        monkeypatch.setattr(maker, "cores", lambda: 2)
     files = sorted(file.relative_to(folders[0]) for file in folders[0].rglob("*") if file.is_file())
     first, second, other = ([(folder / file).read_bytes() for file in files] for folder in folders)
     assert len(files) >= 6 and first == second != other
