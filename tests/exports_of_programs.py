@@ -8,7 +8,6 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pycolmap
@@ -176,53 +175,45 @@ def metashape(model: pycolmap.Reconstruction, images: Path, folder: Path, rig: b
 
     rig: each photo has a sensor, whose place is told beside the first one's, and the third photo alone has a pose.
     """
-    camera = next(iter(model.cameras.values()))
+    camera, photos = next(iter(model.cameras.values())), _photos(model)
     fx, fy, cx, cy, *terms = camera.params.tolist()
-    fisheye = camera.model.name == "OPENCV_FISHEYE"
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p2", "p1")  # p1 and p2 are OpenCV's, exchanged
+    kind = "fisheye" if camera.model.name == "OPENCV_FISHEYE" else "frame"
+    names = ("k1", "k2", "k3", "k4") if kind == "fisheye" else ("k1", "k2", "p2", "p1")  # OpenCV's p1, p2, exchanged
     values = {"f": fy, "cx": cx - camera.width / 2, "cy": cy - camera.height / 2, "b1": fx - fy}
     values |= dict(zip(names, terms, strict=True))
-    document = ElementTree.Element("document", version="2.0.0")
-    chunk = ElementTree.SubElement(document, "chunk", label="Chunk 1", enabled="true")
-    kind, size = "fisheye" if fisheye else "frame", {"width": str(camera.width), "height": str(camera.height)}
-    sensors, first = _under(chunk, "sensors"), _photos(model)[0].cam_from_world()
-    for number, image in enumerate(_photos(model)[: None if rig else 1]):
-        about = {"id": str(number), "label": "unknown", "type": kind} | ({"master_id": "0"} if number else {})
-        sensor = ElementTree.SubElement(sensors, "sensor", about)
-        ElementTree.SubElement(sensor, "resolution", size)
-        for state, numbers in (("adjusted", values), ("initial", {"f": 50.0})):
-            calibration = ElementTree.SubElement(sensor, "calibration", {"type": kind, "class": state})
-            ElementTree.SubElement(calibration, "resolution", size)
-            for name, value in numbers.items():
-                _under(calibration, name, value)
-        if number:
-            place = (first * image.cam_from_world().inverse()).matrix()
-            _under(sensor, "rotation", place[:, :3])
-            _under(sensor, "location", place[:, 3])
-    component = ElementTree.SubElement(_under(chunk, "components"), "component", id="0", label="Component 1")
-    to_world = _under(component, "transform")
-    for name, value in (("rotation", TURN), ("translation", SHIFT), ("scale", SCALE)):
-        _under(to_world, name, value)
-    cameras = _under(chunk, "cameras")
-    for number, image in enumerate(_photos(model)):
-        part = ("left", "right")[number % 2]
-        _copy(images / image.name, folder / "images" / part / f"{stem_of(image).upper()}.JPG")
-        about = {"id": str(number), "sensor_id": str(number * rig), "label": stem_of(image).upper()}
-        if rig and number != 2:
-            ElementTree.SubElement(cameras, "camera", about, master_id="2")
-            continue
-        pose = np.eye(4)
+    resolution = _xml("resolution", width=camera.width, height=camera.height)
+    lenses = resolution
+    for state, numbers in (("adjusted", values), ("initial", {"f": 50.0})):
+        terms = [_xml(name, _text(value)) for name, value in numbers.items()]
+        lenses += _xml("calibration", resolution, *terms, **{"type": kind, "class": state})
+    sensors, cameras = "", ""
+    for number, image in enumerate(photos):
+        name, pose = stem_of(image).upper(), np.eye(4)
+        _copy(images / image.name, folder / "images" / ("left", "right")[number % 2] / f"{name}.JPG")
         pose[:3] = image.cam_from_world().inverse().matrix()
-        _under(ElementTree.SubElement(cameras, "camera", about, component_id="0"), "transform", pose)
-    ElementTree.SubElement(cameras, "camera", id="99", sensor_id="0", label="unaligned")
-    ElementTree.ElementTree(document).write(folder / "cameras.xml", encoding="UTF-8", xml_declaration=True)
+        place = (photos[0].cam_from_world() * image.cam_from_world().inverse()).matrix()
+        of_rig = _xml("rotation", _text(place[:, :3])), _xml("location", _text(place[:, 3]))
+        about = {"id": number, "label": "unknown", "type": kind} | ({"master_id": 0} if number else {})
+        sensors += _xml("sensor", lenses, *(of_rig if number else ()), **about) if rig or not number else ""
+        about, where = {"component_id": 0}, _xml("transform", _text(pose))
+        if rig and number != 2:
+            about, where = {"master_id": 2}, ""
+        cameras += _xml("camera", where, id=number, sensor_id=number * rig, label=name, **about)
+    cameras += _xml("camera", id=99, sensor_id=0, label="unaligned")
+    world = (_xml(name, _text(it)) for name, it in (("rotation", TURN), ("translation", SHIFT), ("scale", SCALE)))
+    component = _xml("components", _xml("component", _xml("transform", *world), id=0, label="Component 1"))
+    parts = _xml("sensors", sensors), component, _xml("cameras", cameras)
+    document = _xml("document", _xml("chunk", *parts, label="Chunk 1", enabled="true"), version="2.0.0")
+    (folder / "cameras.xml").write_text('<?xml version="1.0" encoding="UTF-8"?>\n' + document)
     points = SCALE * points_of(model) @ TURN.T + SHIFT
     write_point_cloud(folder / "points3D.ply", points, np.full(points.shape, 90))
     return points
 
 
-def _under(parent: ElementTree.Element, tag: str, value: float | np.ndarray | None = None) -> ElementTree.Element:
-    element = ElementTree.SubElement(parent, tag)
-    if value is not None:
-        element.text = " ".join(repr(float(number)) for number in np.ravel(value))
-    return element
+def _xml(tag: str, *content: str, **attributes: object) -> str:
+    words = "".join(f' {name}="{value}"' for name, value in attributes.items())
+    return f"<{tag}{words}>{''.join(content)}</{tag}>"
+
+
+def _text(values: float | np.ndarray) -> str:
+    return " ".join(repr(float(number)) for number in np.ravel(values))

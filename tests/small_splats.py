@@ -1,6 +1,7 @@
 """Splats for tests of exports: random ones, such with extreme values, and very many in a file of few bytes."""
 
 import gzip
+import json
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,14 @@ def written(folder: Path, ending: str, some: Splats, name: str = "model") -> Pat
     path = folder / (name + ending)
     find_format(path).write(path, some)
     return path
+
+
+def read_glb(path: Path) -> tuple[dict, bytes]:
+    """The document of a GLB file and its binary chunk."""
+    content = path.read_bytes()
+    magic, version, length, size = struct.unpack_from("<4sIII", content)
+    assert (magic, version, length) == (b"glTF", 2, len(content))
+    return json.loads(content[20 : 20 + size]), content[28 + size :]
 
 
 def splats(count: int, degree: int = 3, seed: int = 0, antialiasing: bool = False) -> Splats:

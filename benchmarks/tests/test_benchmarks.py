@@ -8,15 +8,16 @@ from pathlib import Path
 
 import pytest
 import stand_ins
+import torch
+from gaussians import model
 from torch.profiler import ProfilerActivity, profile
 
 import train
 from applications.evaluation.configs import read_configs
-from benchmarks.accuracy import hashes, oracle
+from benchmarks.accuracy import census, hashes, oracle
 from benchmarks.accuracy.runs import CPU_DOUBLE, CPU_FLOAT, CUDA_FLOAT
 from benchmarks.kernels import rasterizer
 from benchmarks.parallel import steps
-from benchmarks.scenes import conversion
 from utils.system_utils import UserError
 
 
@@ -75,22 +76,18 @@ def test_the_kernels_are_timed(colmap_scene, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.slow
 def test_steps_of_ranks_and_of_a_spilled_model_stand_beside_those_of_one_process(monkeypatch, capsys):
-    words = "--size 64 40 --rounds 1 --warm_up 2 --blocks 2 --workload city --gaussians 1000 --crop 2"
     launch = steps.launch  # one rank needs no process of its own
     here = lambda case, limit: steps.measure(case) if case["ranks"] == 1 else launch(case, limit)  # noqa: E731
     monkeypatch.setattr(steps, "launch", here)
-    monkeypatch.setattr(sys, "argv", ["steps", "--ranks", "1", "2", *words.split()])
-    steps.main()
-    rows = _rows(capsys.readouterr().out, "city")
-    assert [row[1:3] for row in rows] == [["1", "gpu"], ["2", "gpu"]]
-    assert rows[0][6] == "1.00" and float(rows[1][6]) > 0
     monkeypatch.setattr("splatting.spill.refuse_without_gpu", lambda device: None)
-    monkeypatch.setattr(
-        sys, "argv", ["steps", "--model", "sleep", "spill", "--learn", "--cap", "0.001", *words.split()]
-    )
-    steps.main()
-    rows = _rows(capsys.readouterr().out, "city")
-    assert rows[0][-1] == rows[1][-1] != ""
+    found = []
+    for words in ("--ranks 1 2", "--model sleep spill --learn --cap 0.001"):
+        words += " --size 64 40 --rounds 1 --warm_up 2 --blocks 2 --workload city --gaussians 1000 --crop 2"
+        monkeypatch.setattr(sys, "argv", ["steps", *words.split()])
+        steps.main()
+        found += _rows(capsys.readouterr().out, "city")
+    assert [row[1:3] for row in found[:2]] == [["1", "gpu"], ["2", "gpu"]]
+    assert found[0][6] == "1.00" and float(found[1][6]) > 0 and found[2][-1] == found[3][-1] != ""
 
 
 def test_runs_agree_with_the_oracle_and_are_reported(monkeypatch, capsys):
@@ -114,30 +111,34 @@ def test_equal_letters_are_equal_bytes(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr(hashes, "TRAININGS", {"default": "--iterations 2", "seed": "--iterations 2 --seed 1"})
     monkeypatch.setattr(hashes, "_SCENE", (3, 32, 24, 60, 0))
     monkeypatch.setattr(hashes, "run_child", stand_ins.run_here)
-    monkeypatch.setattr(sys, "argv", ["hashes", "--device", "cpu"])
+    stored, words = tmp_path / "other.jsonl", ["hashes", "--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", words)
     hashes.main()
     first = json.loads(capsys.readouterr().out)
-    other = first | {"sha256": first["sha256"] | {"seed": "0" * 64}}
-    (tmp_path / "other.jsonl").write_text(json.dumps(other))
-    monkeypatch.setattr(sys, "argv", ["hashes", "--device", "cpu", "--compare", str(tmp_path / "other.jsonl")])
+    stored.write_text(json.dumps(first | {"sha256": first["sha256"] | {"seed": "0" * 64}}))
+    monkeypatch.setattr(sys, "argv", [*words, "--compare", str(stored)])
     hashes.main()
     said = capsys.readouterr()
     rows = [line.strip("|").split("|")[-4:] for line in said.err.splitlines() if line.startswith("|")]
     assert json.loads(said.out)["sha256"] == first["sha256"]
     assert [[cell.strip() for cell in row] for row in rows[2:]] == [["A", "A", "A", "A"], ["A", "A", "A", "B"]]
-    (tmp_path / "other.jsonl").write_text("{}")
+    stored.write_text("{}")
     with pytest.raises(UserError, match="--compare"):
         hashes.main()
 
 
-def test_stages_from_photos_to_a_page_are_in_their_order(tmp_path):
-    report = {"photos": 3, "seconds": {"mapping": 2.0, "features": 5.0}}
-    results = [
-        conversion.Result(10.0, 0, "", 1.0, report, later={"page": 4.0, "training": 20.0}),
-        conversion.Result(1.0, 2, "no photos", 1.0),
-    ]
-    labels = [["fox", ""], ["none", ""]]
-    assert conversion.list_stages(results) == ["features", "mapping", "rest", "training", "page"]
-    assert conversion.stage_table(labels, results) == [["fox", "", "5.0", "2.0", "3.0", "20.0", "4.0"]]
-    conversion.draw(tmp_path / "stages.png", labels, results)
-    assert (tmp_path / "stages.png").read_bytes().startswith(b"\x89PNG")
+def test_the_command_prints_quantiles_cases_and_what_no_case_covers(tmp_path, monkeypatch, capsys):
+    gaussians, file = model(50), tmp_path / "a.ply"
+    with torch.no_grad():
+        gaussians.raw("scaling")[:, 0] += 8  # needles of ratios that the first cases do not have
+    gaussians.save_ply(file)
+    monkeypatch.setattr(census, "CASES", census.CASES[:2])
+    monkeypatch.setattr(sys, "argv", ["census", f"thin={file}", str(file), "--figure", str(tmp_path / "a.png")])
+    census.main()
+    said = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in said.splitlines() if line.startswith("| ")]
+    assert [row[1] for row in rows if row[0] == "thin"][:5] == list(census.AXES.values())
+    assert "thin: 50 Gaussians, 8 made views" in said and [row for row in rows if row[0] == "a"]
+    assert [row[1][:5] for row in rows if row[0] == "needles, axes 1 : 1e+02"] == ["100 ("]
+    assert [row for row in rows if row[0] == "thin" and row[-1].endswith("%")]
+    assert (tmp_path / "a.png").stat().st_size > 10_000

@@ -28,44 +28,35 @@ def _worse(found: list[dict[str, float]]) -> list[str]:
     return [row.name for row in judge_quality("a", STORED, found) if not row.passed]
 
 
-@pytest.mark.parametrize(
-    ("name", "mean", "deviation"),
-    [
-        ("PSNR", 30, -DEVIATION),
-        ("SSIM", 0.9, -DEVIATION / 100),
-        ("Gaussians", 1002, 1002 * 0.002),  # the seeds agree to 0.16 %, so the least deviation of 0.2 % counts
-        ("bytes", 62002, 62002 * 0.002),
-    ],
-)
+@pytest.mark.parametrize(("name", "mean", "deviation"), [
+    ("PSNR", 30, -DEVIATION),
+    ("SSIM", 0.9, -DEVIATION / 100),
+    ("Gaussians", 1002, 1002 * 0.002),  # the seeds agree to 0.16 %, so the least deviation of 0.2 % counts
+    ("bytes", 62002, 62002 * 0.002),
+])  # fmt: skip
 def test_three_deviations_are_allowed(name, mean, deviation):
     assert _worse(_found(**{name: mean + 2.99 * deviation})) == []
     assert _worse(_found(**{name: mean + 3.01 * deviation})) == [name]
 
 
-@pytest.mark.parametrize(
-    ("pairs", "ratio", "passed"),
-    [
-        ([(10.9, 10.0), (13.1, 12.0)], 1.0908, True),
-        ([(11.2, 10.0), (13.3, 12.0)], 1.1142, False),
-        ([(20.0, 10.0), (5.0, 10.0)], 1.0, True),  # ratios are averaged as logarithms
-    ],
-)
+@pytest.mark.parametrize(("pairs", "ratio", "passed"), [
+    ([(10.9, 10.0), (13.1, 12.0)], 1.0908, True),
+    ([(11.2, 10.0), (13.3, 12.0)], 1.1142, False),
+    ([(20.0, 10.0), (5.0, 10.0)], 1.0, True),  # ratios are averaged as logarithms
+])  # fmt: skip
 def test_time_may_rise_by_a_tenth(pairs, ratio, passed):
     row = judge_time("a", pairs)
     assert (round(row.found, 4), row.passed) == (ratio, passed)
 
 
-@pytest.mark.parametrize(
-    ("content", "scenes", "iterations", "complaint"),
-    [
-        (None, "abc", 1000, "has no baseline of this kind of machine"),
-        ("{", "abc", 1000, "is not JSON"),
-        (json.dumps({"kind": RECORD}), "abd", 1000, "is of a, b, c at 1000 iterations, not of a, b, d at 1000"),
-        (json.dumps({"kind": RECORD}), "abc", 30, "is of a, b, c at 1000 iterations, not of a, b, c at 30"),
-        (json.dumps({"kind": RECORD | {"commit": "--output=x"}}), "abc", 1000, "broken baseline"),
-        (json.dumps({"kind": RECORD | {"scenes": {"a": [{"PSNR": 1.0}] * 2}}}), "a", 1000, "broken baseline"),
-    ],
-)
+@pytest.mark.parametrize(("content", "scenes", "iterations", "complaint"), [
+    (None, "abc", 1000, "has no baseline of this kind of machine"),
+    ("{", "abc", 1000, "is not JSON"),
+    (json.dumps({"kind": RECORD}), "abd", 1000, "is of a, b, c at 1000 iterations, not of a, b, d at 1000"),
+    (json.dumps({"kind": RECORD}), "abc", 30, "is of a, b, c at 1000 iterations, not of a, b, c at 30"),
+    (json.dumps({"kind": RECORD | {"commit": "--output=x"}}), "abc", 1000, "broken baseline"),
+    (json.dumps({"kind": RECORD | {"scenes": {"a": [{"PSNR": 1.0}] * 2}}}), "a", 1000, "broken baseline"),
+])  # fmt: skip
 def test_a_baseline_that_does_not_fit_says_what_to_do(tmp_path, content, scenes, iterations, complaint):
     path = tmp_path / "gate.json"
     if content is not None:

@@ -1,21 +1,21 @@
 """Curves of other programs: the CSV, its making from hand-made outputs of theirs, and how a report shows them."""
 
+import contextlib
 import json
+import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
 
+import numpy as np
 import pytest
-import torch
-from diff_gaussian_rasterization import GaussianRasterizationSettings, GaussianRasterizer
+from scipy import stats
 
-import metrics
-import render
 from applications.evaluation import peer_curve
-from benchmarks.peers import curve, gsplat_training
+from benchmarks.peers import targets
+from benchmarks.peers.time_to_target import ecdf
 from splatting.records.error_curve import COLUMNS, PEER_COLUMNS, peers_of, read_peer, write_curve, write_peer
-from utils.graphics_utils import focal2fov, projection
 from utils.system_utils import UserError
 
 
@@ -39,18 +39,15 @@ def test_a_curve_may_have_few_columns_in_any_order(tmp_path):
     assert read_peer(tmp_path / "a.csv") == [{name: ours.get(name) for name in PEER_COLUMNS}]
 
 
-@pytest.mark.parametrize(
-    ("lines", "sentence"),
-    [
-        (("seconds,psnr", "1,2"), "has no column test_psnr"),
-        (("seconds,test_psnr",), "has no points"),
-        (("seconds,test_psnr", "1"), "is not a curve"),
-        (("seconds,test_psnr", "1,"), "a row without test_psnr"),
-        (("seconds,test_psnr", "1,inf"), "test_psnr is inf"),
-        (("seconds,test_psnr", "0,20"), "seconds are 0, and must be above 0"),
-        (("seconds,test_psnr", "one,20"), "could not convert"),
-    ],
-)
+@pytest.mark.parametrize(("lines", "sentence"), [
+    (("seconds,psnr", "1,2"), "has no column test_psnr"),
+    (("seconds,test_psnr",), "has no points"),
+    (("seconds,test_psnr", "1"), "is not a curve"),
+    (("seconds,test_psnr", "1,"), "a row without test_psnr"),
+    (("seconds,test_psnr", "1,inf"), "test_psnr is inf"),
+    (("seconds,test_psnr", "0,20"), "seconds are 0, and must be above 0"),
+    (("seconds,test_psnr", "one,20"), "could not convert"),
+])  # fmt: skip
 def test_files_that_are_no_curves(tmp_path, lines, sentence):
     with pytest.raises(UserError, match=sentence):
         read_peer(written(tmp_path / "a.csv", *lines))
@@ -81,10 +78,10 @@ def _result_of_gsplat(folder: Path) -> Path:
 
 
 def test_gsplats_seconds_are_those_of_training_not_of_a_render(tmp_path):
-    rows = peer_curve.from_gsplat(_result_of_gsplat(tmp_path))
-    found = [(row["iteration"], row["seconds"], row["test_psnr"]) for row in rows]
-    assert found == [(7000, 40.5, 28.25), (30000, 201.0, 30.5)]
-    assert (rows[0]["peak_memory_mib"], rows[0]["gaussians"], rows[0]["test_lpips"]) == (1536, 5000, 0.12)
+    first, last = peer_curve.from_gsplat(_result_of_gsplat(tmp_path))
+    assert (first["iteration"], first["seconds"], first["test_psnr"]) == (7000, 40.5, 28.25)
+    assert (last["iteration"], last["seconds"], last["test_psnr"]) == (30000, 201.0, 30.5)
+    assert (first["peak_memory_mib"], first["gaussians"], first["test_lpips"]) == (1536, 5000, 0.12)
     with pytest.raises(UserError, match="whose --save_steps are its --eval_steps"):
         peer_curve.from_gsplat(tmp_path / "stats" / "nothing")
 
@@ -111,17 +108,14 @@ def test_the_references_console_output_across_a_new_year(tmp_path):
     assert found == [(1000, 100, 24.5, 26.5), (5000, 300, 27.125, None)]
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
+def test_console_outputs_without_what_is_needed(tmp_path):
+    for text, sentence in (
         ("nothing\n", "has no scores of test views"),
         ("[ITER 7] Evaluating test: L1 0.1 PSNR 20.0\n", "has no times at the ends of its lines"),
         ("a [31/02 10:00:00]\n", "whose time does not exist: .31/02 10:00:00."),
-    ],
-)
-def test_console_outputs_without_what_is_needed(tmp_path, text, sentence):
-    with pytest.raises(UserError, match=sentence):
-        peer_curve.from_log(written(tmp_path / "log.txt", text))
+    ):
+        with pytest.raises(UserError, match=sentence):
+            peer_curve.from_log(written(tmp_path / "log.txt", text))
 
 
 READER = "tensorboard.backend.event_processing.event_accumulator"
@@ -174,87 +168,66 @@ def test_the_references_tensorboard_files_give_seconds_without_pauses(tmp_path, 
 
 def test_the_command(tmp_path, monkeypatch, capsys, tensorboard):
     _fill(tensorboard, (5, 9), 9)
-    events = written(tmp_path / "m/events.out.tfevents.1.host", "").parent
-
-    def made(*words: object) -> tuple[list[float], str]:
-        monkeypatch.setattr(sys, "argv", ["peer_curve", *map(str, words), str(tmp_path / "out.csv")])
-        peer_curve.main()
-        return [row["iteration"] for row in read_peer(tmp_path / "out.csv")], capsys.readouterr().out
-
-    for words, iterations, sentence in (
-        (("gsplat", _result_of_gsplat(tmp_path / "g")), [7000, 30000], "contain the scoring and saving"),
-        (("reference", events), [5, 9], "are of training, without scoring"),
-        (("reference", written(tmp_path / "log", LOG)), [1000, 5000], "whole seconds"),
+    events, of_gsplat = written(tmp_path / "m/events.out.tfevents.1.host", "").parent, _result_of_gsplat(tmp_path / "g")
+    out = tmp_path / "out.csv"
+    for kind, source, iterations, sentence in (
+        ("gsplat", of_gsplat, [7000, 30000], "contain the scoring and saving"),
+        ("reference", events, [5, 9], "are of training, without scoring"),
+        ("reference", written(tmp_path / "log", LOG), [1000, 5000], "whole seconds"),
+        ("gsplat", tmp_path / "nowhere", None, "there is no"),
+        ("reference", of_gsplat, None, "has no TensorBoard files; give a saved console output"),
     ):
-        found, said = made(*words)
-        assert found == iterations and "wrote 2 points to" in said and sentence in said
-    for words, sentence in (
-        (("gsplat", tmp_path / "nowhere"), "there is no"),
-        (("reference", tmp_path / "g"), "has no TensorBoard files; give a saved console output"),
-    ):
-        with pytest.raises(UserError, match=sentence):
-            made(*words)
+        monkeypatch.setattr(sys, "argv", ["peer_curve", kind, str(source), str(out)])
+        with pytest.raises(UserError, match=sentence) if iterations is None else contextlib.nullcontext():
+            peer_curve.main()
+            said = capsys.readouterr().out
+            assert "wrote 2 points to" in said and sentence in said
+            assert [row["iteration"] for row in read_peer(out)] == iterations
 
 
-def _gsplat(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
-    """Put a stand-in in the place of gsplat, which needs a GPU: our rasterizer; return the calls of its strategies."""
-    called = []
-
-    def rasterization(means, quats, scales, opacities, colors, viewmats, Ks, width, height, *, backgrounds, **options):
-        assert options["packed"] is False
-        (fx, _, cx), (_, fy, cy) = Ks[0, :2].tolist()
-        view, fov = viewmats[0].T.contiguous(), (focal2fov(fx, width), focal2fov(fy, height))
-        full = view @ projection(0.01, 100.0, *fov, 2 * cx / width - 1, 2 * cy / height - 1).T.float()
-        tans, eye = (width / (2 * fx), height / (2 * fy)), torch.linalg.inv(viewmats[0])[:3, 3]
-        settings = height, width, *tans, backgrounds[0], 1.0, view, full, options["sh_degree"], eye, False, False, False
-        draw = GaussianRasterizer(GaussianRasterizationSettings(*settings))
-        means2d = torch.zeros_like(means[None], requires_grad=True)
-        image = draw(means, means2d[0], opacities, shs=colors, scales=scales, rotations=quats)[0]
-        return image.permute(1, 2, 0)[None], None, {"means2d": means2d}
-
-    class Strategy:
-        def __init__(self, **options):
-            called.append(("start", options))
-
-        def initialize_state(self, **options):
-            called.append(("state", options))
-            return {}
-
-        def check_sanity(self, params, optimizers):
-            assert {name: [params[name]] for name in params} == {
-                name: of.param_groups[0]["params"] for name, of in optimizers.items()
-            }
-
-        def step_pre_backward(self, params, optimizers, state, step, info):
-            info["means2d"].retain_grad()
-
-        def step_post_backward(self, params, optimizers, state, step, info, **options):
-            called.append((step, options))
-
-    found = SimpleNamespace(rasterization=rasterization, MCMCStrategy=Strategy)
-    monkeypatch.setitem(sys.modules, "gsplat", found)
-    return called
+QUICK = [(1.0, 29.0), (2.0, 29.6), (4.0, 29.4)]  # never within 0.2 dB of 30
+SLOW = [(8.0, 29.9), (16.0, 30.0)]
 
 
-def test_gsplat_trains_on_our_scenes_and_is_scored_as_we_are(colmap_scene, tmp_path, monkeypatch):
-    called, out = _gsplat(monkeypatch), tmp_path / "model"
-    words = ["-s", str(colmap_scene), "-m", str(out), "--eval", "--iterations", "80", "--save_iterations", "1", "200"]
-    monkeypatch.setattr(sys, "argv", ["gsplat_training", *words, "--strategy", "mcmc"])
-    gsplat_training.main()
-    steps = [options for step, options in called if isinstance(step, int)]
-    assert len(steps) == 80 and called[0] == ("start", {"cap_max": 10**6})
-    assert steps[0]["lr"] / steps[-1]["lr"] == pytest.approx(100, rel=0.1)
+def test_the_distribution_is_scipys():
+    """Values above 6 never arrive: for scipy, later than all others."""
+    values = np.round(np.random.default_rng(0).exponential(5, 200), 1)  # with equal ones
+    known = values[values <= 6]
+    theirs = stats.ecdf(stats.CensoredData(known, right=np.full(len(values) - len(known), 1e9))).cdf
+    places, shares = ecdf(np.where(values > 6, np.inf, values).tolist())
+    assert places == sorted({*known.tolist()}) and shares == pytest.approx(theirs.evaluate(places), abs=1e-12)
+    assert shares[-1] == pytest.approx(len(known) / len(values)) and ecdf([math.inf]) == ([], [])
 
-    monkeypatch.setattr(sys, "argv", ["curve", "-m", str(out)])
-    curve.main()
-    first, last = read_peer(out / curve.CURVE)
-    assert (first["iteration"], last["iteration"], last["gaussians"]) == (1, 80, 300)
-    assert 0 < first["seconds"] < last["seconds"] and first["test_psnr"] + 0.3 < last["test_psnr"]
-    for script, more in ((render, ["--skip_train", "--eval"]), (metrics, [])):
-        monkeypatch.setattr(sys, "argv", [script.__name__, "-m", str(out), *more])
-        script.main()
-    (scores,) = json.loads((out / "results.json").read_text()).values()
-    assert last["test_psnr"] == pytest.approx(scores["PSNR"], abs=0.02)  # of 8-bit images
-    with pytest.raises(UserError, match="name a new folder"):
-        monkeypatch.setattr(sys, "argv", ["gsplat_training", *words])
-        gsplat_training.main()
+
+def _written(path: Path, points: list[tuple[float, float]]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text("seconds,test_psnr\n" + "".join(f"{seconds},{psnr}\n" for seconds, psnr in points))
+
+
+def test_the_command_finds_scenes_programs_and_seeds_in_the_names_of_folders(tmp_path, monkeypatch, capsys):
+    out, stored, figures = (tmp_path / name for name in ("out", "stored", "figures"))
+    for scene in "ab":
+        _written(out / scene / "adc" / "seed_0" / "error_vs_time.csv", SLOW)
+        _written(out / scene / "adc" / "seed_1" / "error_vs_time.csv", QUICK)
+        _written(stored / "gsplat" / scene / "mcmc_seed0.csv", QUICK)
+        _written(stored / "gsplat" / scene / "notes.csv", QUICK)
+    _written(out / "a" / "gsplat" / "peer.csv", QUICK)
+    _written(stored / "faster" / "a.csv", [(5.0, 31.0)])
+    _written(stored / "faster" / "c.csv", SLOW)
+    monkeypatch.setattr(sys, "argv", ["targets", str(out), "--stored", str(stored), "--figures", str(figures)])
+    targets.main()
+    said = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in said.splitlines() if line.startswith("|")]
+    assert ["a", "31.00", "faster"] in rows and ["b", "30.00", "adc"] in rows
+    assert "lack a scene: gsplat, faster." in said and "one that never arrives counts as never" in said
+    assert ["adc", "4", "2", "50 %", "never", "25 %", "never", "25 %", "never"] in rows
+    assert ["gsplat mcmc", "2", "3", "50 %", "never", "0 %", "never", "0 %", "never"] in rows
+    for name in ("time_to_target", "performance_profile"):
+        assert (figures / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+    _written(out / "a" / "adc" / "seed_0" / "peer.csv", QUICK)
+    with pytest.raises(UserError, match="two curves are of a adc seed_0"):
+        targets.main()
+    monkeypatch.setattr(sys, "argv", ["targets", str(stored / "faster" / "a.csv"), "--figures", str(figures)])
+    with pytest.raises(UserError, match="give an output of full_eval.py"):
+        targets.main()

@@ -71,6 +71,12 @@ def uniform(g: Generator, low: float, high: float, *shape: int) -> Tensor:
     return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
 
 
+def anywhere(g: Generator, n: int, cam: GaussianRasterizationSettings | None = None) -> Tensor:
+    """Draw pixels (n, 2) of the image."""
+    size = (cam.image_width, cam.image_height) if cam else (WIDTH, HEIGHT)
+    return uniform(g, 0, 1, n, 2) * torch.tensor(size)
+
+
 def place_means(pixel: Tensor, depth: Tensor, cam: GaussianRasterizationSettings) -> Tensor:
     """Return means (n, 3) in the view's frame that project to pixels (n, 2) at depths (n,)."""
     size = torch.tensor([cam.image_width, cam.image_height], dtype=torch.float64)
@@ -80,53 +86,35 @@ def place_means(pixel: Tensor, depth: Tensor, cam: GaussianRasterizationSettings
 
 
 def splats(
-    g: Generator,
-    n: int,
-    *,
-    sigma: Tensor | float = 3.0,
-    scales: Tensor | None = None,
-    means: Tensor | None = None,
-    rotations: Tensor | None = None,
-    logits: Tensor | None = None,
-    cam: GaussianRasterizationSettings | None = None,
+    g: Generator, n: int, *, sigma: Tensor | float = 3.0, scales: Tensor | None = None, cam=None, **given: Tensor
 ) -> Parameters:
     """Make n Gaussians over the image at depths 2 to 6.
 
-    sigma: px, (n, 3), or the centre of random ones; scales: world units, instead of sigma. The rest is random unless
-    given.
+    sigma: px, (n, 3), or the centre of random ones; scales: world units, instead of sigma. given: means, rotations and
+    logits, in place of random ones.
     """
     cam = cam or camera()
-    if means is None:
-        size = torch.tensor([cam.image_width, cam.image_height])
-        means = place_means(uniform(g, 0, 1, n, 2) * size, uniform(g, 2, 6, n), cam)
+    means = given["means"] if "means" in given else place_means(anywhere(g, n, cam), uniform(g, 2, 6, n), cam)
     if scales is None:
         if not isinstance(sigma, Tensor):
             sigma = sigma * normal(g, n, 3).mul(0.4).exp()
         scales = sigma * means[:, 2:].abs() * (2 * cam.tanfovx / cam.image_width)
-    logits = normal(g, n, 1) if logits is None else logits.reshape(n, 1)
-    made = {
-        "means": means,
-        "opacities": logits,
-        "scales": torch.log(scales.double()).expand(n, 3),
-        "rotations": normal(g, n, 4) if rotations is None else rotations,
-        "sh_dc": 0.8 * normal(g, n, 1, 3),
-        "sh_rest": 0.1 * normal(g, n, 15, 3),
-    }
+    logits = given["logits"].reshape(n, 1) if "logits" in given else normal(g, n, 1)
+    made = {"means": means, "opacities": logits, "scales": torch.log(scales.double()).expand(n, 3)}
+    made["rotations"] = given["rotations"] if "rotations" in given else normal(g, n, 4)
+    made |= {"sh_dc": 0.8 * normal(g, n, 1, 3), "sh_rest": 0.1 * normal(g, n, 15, 3)}
     return {name: t.float().contiguous() for name, t in made.items()}
 
 
-def among_ordinary(
-    stiff: Parameters, cam: GaussianRasterizationSettings | None = None, absent: Tensor | None = None
-) -> Problem:
+def among_ordinary(stiff: Parameters, cam=None, absent: Tensor | None = None) -> Problem:
     """Make a problem of ordinary Gaussians followed by the stiff ones."""
     ordinary = frustum(ORDINARY, WIDTH, HEIGHT, 3.0, seed=1).parameters
     n = len(stiff["means"])
-    is_stiff = torch.cat([torch.zeros(ORDINARY, dtype=torch.bool), torch.ones(n, dtype=torch.bool)])
-    is_absent = torch.zeros(ORDINARY + n, dtype=torch.bool)
-    if absent is not None:
-        is_absent[ORDINARY:] = absent
+    before = torch.zeros(ORDINARY, dtype=torch.bool)
+    is_absent = torch.zeros(n, dtype=torch.bool) if absent is None else absent
     parameters = {name: torch.cat([ordinary[name], stiff[name]]) for name in PARAMETERS}
-    return Problem(parameters, cam or camera(), is_stiff, is_absent)
+    is_stiff = torch.cat([before, torch.ones(n, dtype=torch.bool)])
+    return Problem(parameters, cam or camera(), is_stiff, torch.cat([before, is_absent]))
 
 
 def all_stiff(parameters: Parameters, cam: GaussianRasterizationSettings, raw: bool = True) -> Problem:
@@ -224,11 +212,9 @@ def edge_on(cam: GaussianRasterizationSettings) -> Callable[[Generator], Problem
 
     def make(g: Generator) -> Problem:
         n = 30
-        means = place_means(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), uniform(g, 2, 6, n), camera())
-        thin = torch.nn.functional.normalize(torch.linalg.cross(means, normal(g, n, 3)))
-        return among_ordinary(
-            splats(g, n, sigma=axes(n, 1e-3, 20, 20), means=means, rotations=turn_x_to(thin), cam=cam), cam
-        )
+        means = place_means(anywhere(g, n), uniform(g, 2, 6, n), camera())
+        thin = turn_x_to(torch.nn.functional.normalize(torch.linalg.cross(means, normal(g, n, 3))))
+        return among_ordinary(splats(g, n, sigma=axes(n, 1e-3, 20, 20), means=means, rotations=thin, cam=cam), cam)
 
     return make
 
@@ -246,21 +232,19 @@ def round_ones(g: Generator) -> Problem:
 
 
 def stretched(
-    length: tuple[float, float],
-    ratio: tuple[float, float],
-    logit: tuple[float, float] = (-2, 2),
-    depth: tuple[float, float] = (2, 6),
+    length: tuple[float, float], ratio: tuple[float, float], logit: tuple = (-2, 2), depth: tuple = (2, 6)
 ) -> Callable[[Generator], Problem]:
     """Make needles, pancakes and what lies between, as in trained models: sigma px, axis ratio, logit, depth."""
 
-    def between(g: Generator, low: float, high: float, n: int) -> Tensor:
-        return low * (high / low) ** uniform(g, 0, 1, n)
-
     def make(g: Generator) -> Problem:
         n = 200
-        longest, by = between(g, *length, n), between(g, *ratio, n)
+
+        def between(low: float, high: float) -> Tensor:
+            return low * (high / low) ** uniform(g, 0, 1, n)
+
+        longest, by = between(*length), between(*ratio)
         sigma = torch.stack([longest, longest / by ** uniform(g, 0, 1, n), longest / by], 1)
-        means = place_means(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), between(g, *depth, n), camera())
+        means = place_means(anywhere(g, n), between(*depth), camera())
         return among_ordinary(splats(g, n, sigma=sigma, means=means, logits=uniform(g, *logit, n)))
 
     return make
@@ -295,9 +279,8 @@ SHAPE = [
 def make_depths(*depths: float) -> Callable[[Generator], Problem]:
     def make(g: Generator) -> Problem:
         z = torch.tensor(depths).double().repeat_interleave(4)
-        n = len(z)
-        means = place_means(uniform(g, 0, 1, n, 2) * torch.tensor([WIDTH, HEIGHT]), z, camera())
-        return among_ordinary(splats(g, n, means=means))
+        means = place_means(anywhere(g, len(z)), z, camera())
+        return among_ordinary(splats(g, len(z), means=means))
 
     return make
 
@@ -411,7 +394,7 @@ def many_opaque(g: Generator) -> Problem:
 
 def tied(g: Generator, equal: bool) -> Problem:
     """Make thirty Gaussians at one depth; if `equal`, ten different ones three times."""
-    means = place_means(uniform(g, 0, 1, 10, 2) * torch.tensor([WIDTH, HEIGHT]), torch.full((10,), 3.0), camera())
+    means = place_means(anywhere(g, 10), torch.full((10,), 3.0), camera())
     if not equal:
         return among_ordinary(splats(g, 30, sigma=8.0, means=torch.cat([means, means + 0.0, means]).roll(1, 0)))
     made = splats(g, 10, sigma=8.0, means=means)

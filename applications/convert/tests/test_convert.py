@@ -4,7 +4,7 @@ import json
 import os
 import shlex
 import shutil
-from collections.abc import Callable
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -185,42 +185,6 @@ def test_photos_that_share_nothing(tmp_path):
     assert not (tmp_path / "images").exists()
 
 
-def _trained(scene: Path) -> None:
-    for path in (scene / "input").iterdir():
-        path.rename(scene / path.name)
-    (scene / "input").rmdir()
-    (scene / "cfg_args").touch()
-
-
-def _converted(scene: Path) -> None:
-    (scene / "input").rename(scene / "images")
-    (scene / "transforms.json").touch()
-
-
-def _few(scene: Path) -> None:
-    for number in (1, 2):
-        (scene / "input" / f"photo_0{number}.png").unlink()
-    (scene / "input" / "walk.mp4").touch()
-
-
-def _only_video(scene: Path) -> None:
-    (scene / "input").rename(scene / "depth")
-    (scene / "rgb.mp4").touch()
-
-
-def _in_a_scene(scene: Path) -> None:
-    (scene / "input").rename(scene / "else")
-    (scene / "transforms.json").touch()
-
-
-def _renamed(name: str) -> Callable[[Path], object]:
-    def rename(scene: Path) -> None:
-        (scene / name).parent.mkdir(parents=True, exist_ok=True)
-        (scene / "input").rename(scene / name)
-
-    return rename
-
-
 def _given(folder: Path, count: int) -> Path:
     """Write transforms.json with the poses of make_photos's photos, of cameras twice as large; return its path."""
     frames = []
@@ -235,87 +199,75 @@ def _given(folder: Path, count: int) -> Path:
     return path
 
 
-def _of_poses(old: str, new: str) -> Callable[[Path], object]:
-    """Given poses whose file has other words."""
-
-    def change(scene: Path) -> None:
-        path = _given(scene, 3)
-        path.write_text(path.read_text().replace(old, new))
-
-    return change
+def _edited(old: str, new: str) -> str:
+    """A command that changes words in the file of the given poses."""
+    return f"sed -i 's#{old}#{new}#g' transforms.json"
 
 
-@pytest.mark.parametrize(
-    ("words", "change", "said"),
-    [
-        ("-s {}", _renamed("images"), r"rename its folder images to input"),
-        ("-s {}", _renamed("else"), r"rename its folder else to input and run .*convert.py -s .*room$"),
-        ("-s {}", _renamed("else.pdf/a/b"), r"make it and put the photos there, or pass"),
-        ("-s {}", _only_video, r"no folder input in .*room; run .*convert.py -s .*room --video .*room/rgb.mp4"),
-        ("-s {}/else", _in_a_scene, r"no folder input in .*else, which lies in a scene already: train.py takes it"),
-        ("-s {}", lambda scene: (scene / "images").mkdir(), r"already has images, which convert.py did not make"),
-        ("-s {}", lambda scene: (scene / "capture.html").touch(), r"already has capture.html, which convert.py did"),
-        ("-s {} --resize", lambda scene: (scene / "images_4").mkdir(), r"did not make .*images_4, and --resize would"),
-        ("-s {}", _few, r"input: fewer than 3 readable photos .1.; add more.*walk.mp4 \(video: pass it as --video"),
-        ("-s {}", lambda scene: (scene / "input" / "1.HEIC").touch(), r"cannot be read: 1.HEIC \(damaged"),
-        ("-s {}/input", None, r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
-        ("-s {}/nowhere", None, r"no folder .*nowhere; make it, put the photos into a folder input"),
-        ("-s '{}'", None, r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
-        ("-s {}", _trained, r"room is a model that train.py wrote; pass the folder of its photos as -s"),
-        ("-s {}", _converted, r"no folder input in .*room, which is a scene already: train.py takes it as it is"),
-        ("-s {}/input/photo_00.png", None, r"photo_00.png is a file; pass the folder that contains"),
-        ("-s {} --camera PINHOLEY", None, r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE"),
-        ("-s {} --camera EQUIRECTANGULAR --lenses undistort", None, r"no pinhole image shows a panorama; omit --len"),
-        ("-s {} --poses no", None, r"no poses in no; pass a transforms.json, or the folder of cameras.txt"),
-        ("-s {} --poses x --mapper global", None, r"--mapper does not go with --poses, which gives poses and lenses"),
-        ("-s {} --mask_path no", None, r"no folder of masks 'no'; pass an existing folder"),
-        ("-s {} --mask_path {}", None, r"none of 3 photos has a mask .*photo_00.png.png"),
-        ("-s {} --max_num_features 0", None, r"--max_num_features must be at least 100, got 0"),
-        ("-s {} --skip_matching", None, r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
-        ("-s {} --colmap_executable /no/colmap", None, r"cannot run --colmap_executable /no/colmap"),
-        ("-s {} --poses", _of_poses('"w": 480', '"w": 360'), "photo_00.png has 40 x 30 pixels .* 360 x 360; use the"),
-        ("-s {} --poses", _of_poses("photo_0", "frame_"), "0 photos of .*input have a pose in .*lists ./images/frame"),
-        (
-            "-s {} --poses",
-            _of_poses("photo_01", "left/photo_02"),
-            "photo_02 and .*photo_02 in .* of the photo photo_02",
-        ),
-        ("-s {} --poses", _of_poses("transform_matrix", "pose"), "frame 1 .* has no transform_matrix"),
-    ],
-)
+@pytest.mark.parametrize(("words", "change", "said"), [
+    ("-s {}", "mv input images", r"rename its folder images to input"),
+    ("-s {}", "mv input else", r"rename its folder else to input and run .*convert.py -s .*room$"),
+    ("-s {}", "mkdir -p else.pdf/a; mv input else.pdf/a/b", r"make it and put the photos there, or pass"),
+    ("-s {}", "mv input depth; touch rgb.mp4", r"no folder input in .*room; run .*convert.py -s .*room --video .*/rgb"),
+    ("-s {}/else", "mv input else; touch transforms.json", r"no folder input in .*else, which lies in a scene already"),
+    ("-s {}", "mkdir images", r"already has images, which convert.py did not make"),
+    ("-s {}", "touch capture.html", r"already has capture.html, which convert.py did"),
+    ("-s {} --resize", "mkdir images_4", r"did not make .*images_4, and --resize would"),
+    ("-s {}", "cd input; rm photo_0[12]*; touch walk.mp4", r"photos .1.; add .*walk.mp4 \(video: pass it as --video"),
+    ("-s {}", "touch input/1.HEIC", r"cannot be read: 1.HEIC \(damaged"),
+    ("-s {}/input", "", r"room/input is the folder of the photos itself; pass its parent folder as -s: .*room$"),
+    ("-s {}/nowhere", "", r"no folder .*nowhere; make it, put the photos into a folder input"),
+    ("-s '{}'", "", r"contains quotes: '.*room'; pass /.*room, quoted only once for the shell"),
+    ("-s {}", "mv input/* .; rmdir input; touch cfg_args", r"room is a model that train.py wrote; pass the folder"),
+    ("-s {}", "mv input images; touch transforms.json", r"no folder input in .*room, which is a scene already: train"),
+    ("-s {}/input/photo_00.png", "", r"photo_00.png is a file; pass the folder that contains"),
+    ("-s {} --camera PINHOLEY", "", r"--camera PINHOLEY is not a supported lens model.*OPENCV_FISHEYE"),
+    ("-s {} --camera EQUIRECTANGULAR --lenses undistort", "", r"no pinhole image shows a panorama; omit --len"),
+    ("-s {} --poses no", "", r"no poses in no; pass a transforms.json, or the folder of cameras.txt"),
+    ("-s {} --poses x --mapper global", "", r"--mapper does not go with --poses, which gives poses and lenses"),
+    ("-s {} --mask_path no", "", r"no folder of masks 'no'; pass an existing folder"),
+    ("-s {} --mask_path {}", "", r"none of 3 photos has a mask .*photo_00.png.png"),
+    ("-s {} --max_num_features 0", "", r"--max_num_features must be at least 100, got 0"),
+    ("-s {} --skip_matching", "", r"--skip_matching needs a COLMAP model in .*distorted/sparse"),
+    ("-s {} --colmap_executable /no/colmap", "", r"cannot run --colmap_executable /no/colmap"),
+    ("-s {} --poses", _edited('"w": 480', '"w": 360'), "photo_00.png has 40 x 30 pixels .* 360 x 360; use the"),
+    ("-s {} --poses", _edited("photo_0", "frame_"), "0 photos of .*input have a pose in .*lists ./images/frame"),
+    ("-s {} --poses", _edited("photo_01", "left/photo_02"), "photo_02 and .*photo_02 in .* of the photo photo_02"),
+    ("-s {} --poses", _edited("transform_matrix", "pose"), "frame 1 .* has no transform_matrix"),
+])  # fmt: skip
 def test_slips_get_one_sentence(tmp_path, words, change, said):
-    scene = tmp_path / "room"
+    """change: a command in the folder of the scene."""
+    scene, poses = tmp_path / "room", []
     (scene / "input").mkdir(parents=True)
     for number in range(3):
         Image.new("RGB", (40, 30)).save(scene / "input" / f"photo_{number:02d}.png")
-    if change:
-        change(scene)
+    if words.endswith("--poses"):
+        poses = [str(_given(scene, 3))]
+    subprocess.run(change, shell=True, cwd=scene, check=True)
     with pytest.raises(UserError, match=said) as error:
-        poses = [str(scene / "transforms.json")] * words.endswith("--poses")
         convert.main([word.replace("{}", str(scene)) for word in words.split()] + poses)
-    assert "\n" not in str(error.value)
-    assert not (scene / "sparse").exists()
+    assert "\n" not in str(error.value) and not (scene / "sparse").exists()
 
 
 @pytest.mark.slow
 def test_a_finished_scene_stays_until_the_next_one_is_there(copy, monkeypatch):
-    def scene() -> dict:
-        own = ("input", "distorted")
-        return {name: state for name, state in folder_state(copy).items() if Path(name).parts[0] not in own}
+    """The record still knows that convert.py made it."""
 
-    def refused(said: str, *options: str) -> None:
-        with pytest.raises(UserError, match=said):
-            convert.main(["-s", str(copy), "--no_gpu", *options])
-        assert scene() == before
+    def scene() -> dict:
+        return {
+            name: state for name, state in folder_state(copy).items() if not name.startswith(("input", "distorted"))
+        }
 
     before, work = scene(), folder_state(copy / "distorted")
     assert {"images", "images_2", "sparse"} <= {Path(name).parts[0] for name in before}
-    refused("none of 8 photos has a mask", "--mask_path", str(copy.parent))
-    assert folder_state(copy / "distorted") == work
-    # A later failure keeps the scene too, and the record still knows that convert.py made it.
-    with monkeypatch.context() as patch:
-        patch.setattr(stages, "refuse_unplaced", lambda *_: (_ for _ in ()).throw(UserError("no model")))
-        refused("no model", "--mapper", "global")
+    words = ["-s", str(copy), "--no_gpu"]
+    with pytest.raises(UserError, match="none of 8 photos has a mask"):
+        convert.main([*words, "--mask_path", str(copy.parent)])
+    assert scene() == before and folder_state(copy / "distorted") == work
+    monkeypatch.setattr(stages, "refuse_unplaced", lambda *_: (_ for _ in ()).throw(UserError("no model")))
+    with pytest.raises(UserError, match="no model"):
+        convert.main([*words, "--mapper", "global"])
+    assert scene() == before
 
 
 def _interrupt(*_: object, **__: object) -> None:

@@ -41,20 +41,17 @@ def small(path: Path, made: Image.Exif | None = None, size: tuple[int, int] = (8
     return path.name
 
 
-@pytest.mark.parametrize(
-    ("made", "found", "said"),
-    [
-        (exif({}), Lens(), "a lens that EXIF does not name"),
-        (exif(), Lens("Maker", "Phone 3"), "Maker Phone 3"),
-        (exif(FocalLength=6.86, FocalLengthIn35mmFilm=48, LensModel="back \x00"),
-         Lens("Maker", "Phone 3", "back", 6.86, 48), "Maker Phone 3, back, 6.86 mm (as 48 mm on 35 mm film)"),
-        (exif(CAM, FocalLengthIn35mmFilm=35), Lens("Cam", "Cam 5", film=35), "Cam 5, as 35 mm on 35 mm film"),
-        (exif(CAM, FocalLength=4.0, DigitalZoomRatio=2.0), Lens("Cam", "Cam 5", focal=4, zoom=2),
-         "Cam 5, 4 mm, digital zoom 2"),
-        (exif(CAM, FocalLength=4.0, DigitalZoomRatio=1.0), Lens("Cam", "Cam 5", focal=4), "Cam 5, 4 mm"),
-        (exif(CAM, FocalLength=4.0, DigitalZoomRatio=0.0), Lens("Cam", "Cam 5", focal=4), "Cam 5, 4 mm"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("made", "found", "said"), [
+    (exif({}), Lens(), "a lens that EXIF does not name"),
+    (exif(), Lens("Maker", "Phone 3"), "Maker Phone 3"),
+    (exif(FocalLength=6.86, FocalLengthIn35mmFilm=48, LensModel="back \x00"),
+     Lens("Maker", "Phone 3", "back", 6.86, 48), "Maker Phone 3, back, 6.86 mm (as 48 mm on 35 mm film)"),
+    (exif(CAM, FocalLengthIn35mmFilm=35), Lens("Cam", "Cam 5", film=35), "Cam 5, as 35 mm on 35 mm film"),
+    (exif(CAM, FocalLength=4.0, DigitalZoomRatio=2.0), Lens("Cam", "Cam 5", focal=4, zoom=2),
+     "Cam 5, 4 mm, digital zoom 2"),
+    (exif(CAM, FocalLength=4.0, DigitalZoomRatio=1.0), Lens("Cam", "Cam 5", focal=4), "Cam 5, 4 mm"),
+    (exif(CAM, FocalLength=4.0, DigitalZoomRatio=0.0), Lens("Cam", "Cam 5", focal=4), "Cam 5, 4 mm"),
+])  # fmt: skip
 def test_lenses_are_read_and_named(tmp_path, made, found, said):
     for suffix in ("jpg", "png", "webp"):
         small(tmp_path / f"a.{suffix}", made)
@@ -65,10 +62,8 @@ def test_lenses_are_read_and_named(tmp_path, made, found, said):
 def test_damaged_exif_names_no_lens(tmp_path):
     made = exif(FocalLength=float("nan"), FocalLengthIn35mmFilm=(1, 2), LensModel=b"\xff\xfe")
     assert read_lens(tmp_path / small(tmp_path / "a.jpg", made)).length == 0
-    whole = (tmp_path / "a.jpg").read_bytes()
-    (tmp_path / "b.jpg").write_bytes(whole.replace(b"Exif\0\0MM\0*", b"Exif\0\0XX\0*"))
-    (tmp_path / "c.jpg").write_bytes(b"<html>")
-    assert {read_lens(tmp_path / name) for name in ("b.jpg", "c.jpg", "missing.jpg")} == {Lens()}
+    (tmp_path / "b.jpg").write_bytes((tmp_path / "a.jpg").read_bytes().replace(b"Exif\0\0MM\0*", b"Exif\0\0XX\0*"))
+    assert read_lens(tmp_path / "b.jpg") == read_lens(tmp_path / "missing.jpg") == Lens()
 
 
 LENS = {"LensModel": "back", "FocalLength": 4.0, "FocalLengthIn35mmFilm": 26}
@@ -88,15 +83,12 @@ SHOTS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("mode", "found"),
-    [
-        ("per_lens", ["ag", "b", "c", "d", "e", "f", "hi", "j", "k", "l"]),
-        ("per_folder", ["abcdef", "ghi", "jk", "l"]),
-        ("per_photo", [*"abcdefghijkl"]),
-        ("shared", ["abcdefghijk", "l"]),
-    ],
-)
+@pytest.mark.parametrize(("mode", "found"), [
+    ("per_lens", ["ag", "b", "c", "d", "e", "f", "hi", "j", "k", "l"]),
+    ("per_folder", ["abcdef", "ghi", "jk", "l"]),
+    ("per_photo", [*"abcdefghijkl"]),
+    ("shared", ["abcdefghijk", "l"]),
+])  # fmt: skip
 def test_who_shares_a_camera(tmp_path, mode, found):
     for name, made in SHOTS.items():
         small(tmp_path / name, made, (8, 6) if "l" not in Path(name).stem else (6, 8))
@@ -158,16 +150,13 @@ def _advice(*words) -> list[str]:
     return [*map(str, check_shared_cameras(*words))]
 
 
-@pytest.mark.parametrize(
-    ("found", "said"),
-    [
-        (survey(*[1.005] * 9), None),
-        (survey(1.2, 0.9, *[1.0] * 7), None),  # two may be wrong for other reasons
-        (survey(1.2, 0.9, 1.1, *[1.0] * 77), None),
-        (survey(1.2, 0.9, 1.1, *[1.0] * 7, gain=0.95), None),
-        (survey(1.2, 0.9, 1.1, *[1.0] * 7), r"3 of 10 photos .* \(0.jpg, 1.jpg, 2.jpg\) .* 0.90 to 1.20 times"),
-    ],
-)
+@pytest.mark.parametrize(("found", "said"), [
+    (survey(*[1.005] * 9), None),
+    (survey(1.2, 0.9, *[1.0] * 7), None),  # two may be wrong for other reasons
+    (survey(1.2, 0.9, 1.1, *[1.0] * 77), None),
+    (survey(1.2, 0.9, 1.1, *[1.0] * 7, gain=0.95), None),
+    (survey(1.2, 0.9, 1.1, *[1.0] * 7), r"3 of 10 photos .* \(0.jpg, 1.jpg, 2.jpg\) .* 0.90 to 1.20 times"),
+])  # fmt: skip
 def test_photos_of_another_focal_length_are_named(found, said):
     found[0]["photos"]["few points.jpg"] = []
     lines = _advice(found, {}, "shared")
@@ -177,20 +166,16 @@ def test_photos_of_another_focal_length_are_named(found, said):
     assert len(lines) == (said is not None) and (not said or re.search(said.replace("of 10", "of 11"), lines[0]))
 
 
-@pytest.mark.parametrize(
-    ("mode", "known", "count"), [("per_lens", 2, 1), ("per_lens", 3, 0), ("per_lens", 0, 0), ("shared", 2, 0)]
-)
-def test_photos_without_exif_among_others_are_named(mode, known, count):
-    lines = _advice([], {f"{number}.jpg": Lens(film=26.0 * (number < known)) for number in range(3)}, mode)
-    assert len(lines) == count and all("1 of 3 photos name no lens (2.jpg), and" in line for line in lines)
-
-
-def test_frames_of_videos_need_no_exif():
-    known = {"0.jpg": Lens(film=26.0), "1.jpg": Lens(), "frame_00001.jpg": Lens(), "frame_00002.jpg": Lens()}
-    frames = {"frame_00001.jpg", "frame_00002.jpg"}
-    assert len(_advice([], known, "per_lens", frames)) == 1
-    assert _advice([], known, "per_lens", {*frames, "1.jpg"}) == []
-    assert _advice([], known, "per_lens", {*frames, "0.jpg"}) == []  # of photos none is known
+@pytest.mark.parametrize(("mode", "known", "frames", "count"), [
+    ("per_lens", "yyn", "", 1), ("per_lens", "yyy", "", 0), ("per_lens", "nnn", "", 0), ("shared", "yyn", "", 0),
+    ("per_lens", "ynnn", "23", 1), ("per_lens", "ynnn", "123", 0), ("per_lens", "ynnn", "023", 0),
+])  # fmt: skip
+def test_photos_without_exif_among_others_are_named(mode, known, frames, count):
+    """frames: photos that are of a video, which need none."""
+    lenses = {f"{number}.jpg": Lens(film=26.0 * (has == "y")) for number, has in enumerate(known)}
+    lines = _advice([], lenses, mode, {f"{number}.jpg" for number in frames})
+    assert len(lines) == count and all("photos name no lens" in line for line in lines)
+    assert count == 0 or frames or "1 of 3 photos name no lens (2.jpg), and" in lines[0]
 
 
 def test_the_doctor_compares_cameras_with_exif(colmap_scene):

@@ -139,12 +139,12 @@ def test_photos_that_can_not_be_read_stop_unless_they_are_left_out(tmp_path, hei
         picture_size(tmp_path / "a.png")
     found = {"4.NEF": "RAW: ", "5.tif": "RAW: ", "6.heic": "damaged: ", "7.hif": "HDR picture: ", "a.png": "too large"}
     found |= {"b.jfif": "too large", "c.tif": "floating-point pixels: ", "day 2": "a link to a folder or to nothing: "}
+    found |= {"8.jpg": "", "9.png": "a web page"}
     said = r"^8 photos in .* cannot be read: .*4.NEF, 5.tif \(RAW: .*; follow these hints, or pass --skip_unreadable"
     with pytest.raises(UserError, match=said):
         sort_inputs(tmp_path)
     (tmp_path / "8.jpg").write_bytes((tmp_path / "1.jpg").read_bytes()[:-60])
     (tmp_path / "9.png").write_bytes(b"<html>")
-    found |= {"8.jpg": "", "9.png": "a web page"}
     taken = sort_inputs(tmp_path, skip_unreadable=True)
     assert taken.photos == ["1.jpg", "2.jpg", "3.jpg"]
     assert all(taken.unused[name].startswith(reason) for name, reason in found.items())
@@ -162,21 +162,15 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
 
 
 @pytest.mark.parametrize("end", ["jpg", "png", "tif", "webp"])
-@pytest.mark.parametrize(
-    ("size", "tags", "found"),
-    [
-        ((64, 32), 'GPano:ProjectionType="equirectangular"', (True, True)),
-        ((64, 32), 'x="1"><GPano:ProjectionType>equirectangular</GPano:ProjectionType', (True, True)),
-        ((64, 32), 'GPano:ProjectionType="cylindrical"', (True, False)),
-        ((64, 31), 'GPano:ProjectionType="equirectangular"', (False, False)),
-        (
-            (64, 32),
-            'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="128" '
-            'GPano:CroppedAreaImageWidthPixels="64"',
-            (True, False),
-        ),
-    ],
-)
+@pytest.mark.parametrize(("size", "tags", "found"), [
+    ((64, 32), 'GPano:ProjectionType="equirectangular"', (True, True)),
+    ((64, 32), 'x="1"><GPano:ProjectionType>equirectangular</GPano:ProjectionType', (True, True)),
+    ((64, 32), 'GPano:ProjectionType="cylindrical"', (True, False)),
+    ((64, 31), 'GPano:ProjectionType="equirectangular"', (False, False)),
+    ((64, 32),
+     'GPano:ProjectionType="equirectangular" GPano:FullPanoWidthPixels="128" ' 'GPano:CroppedAreaImageWidthPixels="64"',
+     (True, False)),
+])  # fmt: skip
 def test_panoramas_are_known_by_xmp(tmp_path, end, size, tags, found):
     xmp = f"<x:xmpmeta xmlns:GPano='http://ns.google.com/photos/1.0/panorama/'><d {tags}></d></x:xmpmeta>".encode()
     options: dict = {"xmp": xmp}
@@ -268,34 +262,31 @@ def test_old_photos_keep_poses_and_bytes_and_new_ones_are_placed(room, monkeypat
 
 
 def test_what_cannot_be_added_is_said(room, tmp_path, capsys):
-    scene = room / "scene"
-    with pytest.raises(UserError, match="no new photos"):
-        _run(scene, "--add")
-    with pytest.raises(UserError, match="--poses does not go with --add"):
-        _run(scene, "--add", "--poses", str(scene / "sparse" / "0"))
-    shutil.copytree(room / "all", tmp_path / "other" / "input")
-    with pytest.raises(UserError, match="leave --add out"):
-        _run(tmp_path / "other", "--add")
-    _put(room, *LATER)
-    (scene / "input" / "photo_00.png").unlink()
-    with pytest.raises(UserError, match=r"lacks photo_00\.png; put them back"):
-        _run(scene, "--add")
-    (tmp_path / "masks").mkdir()
-    with pytest.raises(UserError, match="has a mask"):  # by the first stage
-        _run(scene, "--mask_path", str(tmp_path / "masks"))
+    scene, other, masks = room / "scene", tmp_path / "other", tmp_path / "masks"
+    shutil.copytree(room / "all", other / "input")
+    masks.mkdir()
+    for folder, words, said in (
+        (scene, "--add", "no new photos"),
+        (scene, f"--add --poses {scene}/sparse/0", "--poses does not go with --add"),
+        (other, "--add", "leave --add out"),
+        (scene, "--add", r"lacks photo_00\.png; put them back"),
+        (scene, f"--mask_path {masks}", "has a mask"),  # by the first stage
+    ):
+        if said.startswith("lacks"):
+            _put(room, *LATER)
+            (scene / "input" / "photo_00.png").unlink()
+        with pytest.raises(UserError, match=said):
+            _run(folder, *words.split())
     assert "without --add, photos that were added before get new poses" in capsys.readouterr().err
     assert not (scene / "distorted" / "base").exists()
 
 
 def test_photos_that_are_prepared_under_other_names_are_known(tmp_path):
     """By files of kinds that COLMAP does not read, or without a suffix; the model is not asked."""
-    layout, names = Layout(tmp_path), ["a.webp", "b.jp2", "c", "d.avif", "e.png"]
-    layout.input.mkdir()
-    for name, kind in zip(names, ("WEBP", "JPEG2000", "TIFF", "AVIF", "PNG"), strict=True):
-        Image.new("RGB", (32, 24)).save(layout.input / name, kind)
+    layout, names = Layout(tmp_path), ["a.webp", "b.jp2", "c", "e.png"]
+    for name, kind in zip(names, ("WEBP", "JPEG2000", "TIFF", "PNG"), strict=True):
+        _save(layout.input / name, kind)
     prepare_images(layout, names, None)
-    with pytest.raises(UserError, match="has no new photos"):
-        keep_base(layout, True, names)
     layout.base.mkdir()
     with contextlib.closing(sqlite3.connect(layout.base_database)) as database:
         database.execute("CREATE TABLE images (name TEXT)")

@@ -1,7 +1,9 @@
 """Stages of convert.py, and programs that it runs: their options, their ends, and its own end while they work."""
 
+import contextlib
 import os
 import signal
+import sqlite3
 import stat
 import subprocess
 import sys
@@ -9,12 +11,13 @@ import threading
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pycolmap
 import pytest
 from waiting import LIMIT, wait_for
 
-from applications.convert import colmap, programs
+from applications.convert import colmap, database, programs
 from applications.convert.colmap import LENS_MODELS, Program, Settings
 from applications.convert.layout import Layout
 from applications.convert.programs import refuse_while_working, run_programs
@@ -110,17 +113,15 @@ def _fake_colmap(folder: Path, prefix: str, without: str = "") -> str:
 def test_options_are_those_of_the_colmap_that_is_there(tmp_path, prefix):
     layout = Layout(tmp_path / "scene")
     program = Program(_fake_colmap(tmp_path, prefix), layout, SETTINGS)
-    (first, second) = program.features([["a b.png"], ["c.png", "d.png"]], masks=True)
-    assert first[-2:] == second[-2:] == [f"--{prefix}Extraction.use_gpu", "0"]
-    assert Path(second[second.index("--image_list_path") + 1]).read_text() == "c.png\nd.png\n"
-    assert first[first.index("--ImageReader.mask_path") + 1] == str(layout.masks)
+    first, second = map(" ".join, program.features([["a b.png"], ["c.png", "d.png"]], masks=True))
+    assert first.endswith(f"--{prefix}Extraction.use_gpu 0") and second.endswith(f"--{prefix}Extraction.use_gpu 0")
+    assert Path(second.partition("--image_list_path ")[2].split(" --")[0]).read_text() == "c.png\nd.png\n"
+    assert f"--ImageReader.mask_path {layout.masks}" in first
     (each,) = program.features([["a b.png"], ["c.png"]], masks=False)
     assert "--ImageReader.single_camera_per_image" in each and "--ImageReader.single_camera" not in each
-    ((_, *match),) = program.matching()
-    database = ["--database_path", str(layout.database)]
-    assert match == ["exhaustive_matcher", *database, f"--{prefix}Matching.use_gpu", "0"]
-    (mapper,) = program.mapping("incremental", layout.models)
-    assert mapper[1] == "mapper" and mapper[-2:] == ["--Mapper.ba_global_function_tolerance", "1e-06"]
+    match, mapper = (" ".join(*words) for words in (program.matching(), program.mapping("incremental", layout.models)))
+    assert match.endswith(f"exhaustive_matcher --database_path {layout.database} --{prefix}Matching.use_gpu 0")
+    assert " mapper " in mapper and mapper.endswith("--Mapper.ba_global_function_tolerance 1e-06")
 
 
 def test_programs_that_can_not_do_it(tmp_path):
@@ -139,11 +140,8 @@ def test_programs_that_can_not_do_it(tmp_path):
         Program(old, layout, whole)
 
 
-def test_every_lens_model_can_be_asked_for():
+def test_every_lens_model_can_be_asked_for_and_which_photos_stay_as_they_are():
     assert {*LENS_MODELS, "INVALID"} == set(pycolmap.CameraModelId.__members__)
-
-
-def test_which_photos_stay_as_they_are():
     stay = {model.removesuffix("_FISHEYE") for model in LENS_MODELS if colmap.is_native("auto", {"OPENCV", model})}
     assert stay == {"EQUIRECTANGULAR", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "THIN_PRISM"}
     assert colmap.is_native("native", {"OPENCV"}) and not colmap.is_native("undistort", {"OPENCV_FISHEYE"})
@@ -175,6 +173,41 @@ def test_stages_are_redone_from_the_first_that_changed(tmp_path):
     assert run(a=1, b=2, c=1, fail="c") == ["-c", "b", "-c", "c", "stopped"]
     assert run(a=1, b=2, c=1) == ["=a", "=b", "-c", "c"]
     assert run(a=2, b=2, c=1)[:4] == ["-c", "-b", "-a", "a"]
+    made = tmp_path / "made"
+    again = [Stage("made", 1, lambda: None, made.touch, makes=[made])]
+    assert [StageRecord(tmp_path / "other.json").run(again) for _ in range(2)] == [[], ["made"]]
+    made.unlink()  # so this is done again
+    assert StageRecord(tmp_path / "other.json").run(again) == [] and made.exists()
     (tmp_path / "stages.json").write_text("[]")
     with pytest.raises(UserError, match="stages.json is damaged; remove the folder"):
         run(a=1)
+
+
+READER = """
+import sqlite3, sys
+connection = sqlite3.connect(sys.argv[1], isolation_level=None)
+connection.execute("BEGIN")
+print(connection.execute("SELECT COUNT(*) FROM images").fetchall(), flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_database_opens_once_its_reader_is_done(tmp_path, monkeypatch):
+    path = tmp_path / "database.db"
+    pycolmap.Database.open(path).close()
+    with contextlib.closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode=DELETE")  # as of a new one
+    process = subprocess.Popen([sys.executable, "-c", READER, path], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert process.stdout.readline()
+    with pytest.raises(RuntimeError):
+        pycolmap.Database.open(path)
+    pauses = []
+    # Not `time.sleep` itself, which threads of other modules call.
+    clock = SimpleNamespace(sleep=lambda seconds: pauses.append(seconds) or process.communicate())
+    monkeypatch.setattr(database, "time", clock)
+    opened = database.opened(path)
+    assert opened.num_images() == 0 and len(pauses) == 1
+    opened.close()
+    path.write_text("no database")
+    with pytest.raises(RuntimeError):
+        database.opened(path)

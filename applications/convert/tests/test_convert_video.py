@@ -1,6 +1,7 @@
 """convert.py --video: frames chosen by motion and sharpness, HDR brought to SDR, several videos, videos with photos."""
 
 import contextlib
+import itertools
 import json
 import re
 import subprocess
@@ -48,6 +49,11 @@ class _Decoder(SimpleNamespace):
                 yield cls.frame(number).convert("L" if pix_fmt == "gray" else "RGB").tobytes()
 
 
+@pytest.fixture
+def decoder(monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+
+
 def _frames(layout: Layout) -> list[Path]:
     return sorted(layout.input.rglob("*.jpg"))
 
@@ -59,8 +65,7 @@ def _extract(scene: Path, video: Path, count: int) -> Layout:
     return layout
 
 
-def test_the_sharpest_frame_of_each_part_is_taken(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+def test_the_sharpest_frame_of_each_part_is_taken(tmp_path, decoder):
     layout = _extract(tmp_path / "few", Path("any.mp4"), 3)
     assert [path.name for path in _frames(layout)] == [f"frame_0000{i}.jpg" for i in (1, 2, 3)]
     for index, path in enumerate(_frames(layout)):
@@ -87,25 +92,19 @@ def test_a_video_makes_its_scene_folder(tmp_path, monkeypatch):
         convert.main(["-s", str(tmp_path / "other")])
 
 
-def test_frames_replace_frames_and_nothing_else(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+def test_frames_replace_frames_and_nothing_else(tmp_path, decoder):
+    """A photo of the user with the name of a frame is never removed."""
     one, two, layout = tmp_path / "a.mp4", tmp_path / "b.mp4", Layout(tmp_path / "scene")
-    for path in (one, two):
-        path.touch()
-    words = ["-s", str(layout.scene), "--mask_path", str(tmp_path), "--video_frames", "4", "--video"]
-
-    def names(*videos: Path) -> set[str]:
-        with pytest.raises(UserError, match="has a mask"):
-            convert.main([*words, *map(str, videos)])
-        return {path.relative_to(layout.input).as_posix() for path in layout.input.rglob("*") if path.is_file()}
-
-    flat = {f"frame_0000{i}.jpg" for i in (1, 2, 3, 4)}
-    layout.input.mkdir(parents=True)
+    one.touch(), two.touch(), layout.input.mkdir(parents=True)
     Image.new("RGB", (40, 30)).save(layout.input / "mine.jpg")
-    assert names(one) == flat | {"mine.jpg"}
-    assert names(one, two) == {f"{stem}/{name}" for stem in "ab" for name in flat} | {"mine.jpg"}
-    assert names(two) == flat | {"mine.jpg"}
-    # A photo of the user with the name of a frame is never removed.
+    flat = {f"frame_0000{i}.jpg" for i in (1, 2, 3, 4)}
+    both = {f"{stem}/{name}" for stem in "ab" for name in flat}
+    for videos, frames in (((one,), flat), ((one, two), both), ((two,), flat)):
+        words = ["-s", layout.scene, "--mask_path", tmp_path, "--video_frames", 4, "--video", *videos]
+        with pytest.raises(UserError, match="has a mask"):
+            convert.main([*map(str, words)])
+        found = {path.relative_to(layout.input).as_posix() for path in layout.input.rglob("*.jpg")}
+        assert found == frames | {"mine.jpg"}
     other = Layout(tmp_path / "other")
     other.input.mkdir(parents=True)
     Image.new("RGB", (40, 30)).save(other.input / "frame_00002.jpg")
@@ -114,12 +113,11 @@ def test_frames_replace_frames_and_nothing_else(tmp_path, monkeypatch):
     assert [path.name for path in _frames(other)] == ["frame_00002.jpg"]
 
 
-def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", _Decoder())
+def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, decoder):
     layout = _extract(tmp_path / "scene", Path("any.mp4"), 4)
     (entry,), frames = json.loads(layout.frames.read_text()), _frames(layout)
-    _frame_elsewhere = frames[3].rename(tmp_path / "frame_00004.jpg")
-    for name in ("../../frame_00004.jpg", str(tmp_path / "frame_00004.jpg"), ".hidden/frame_00004.jpg", "mine.jpg", 5):
+    elsewhere = frames[3].rename(tmp_path / "frame_00004.jpg")
+    for name in ("../../frame_00004.jpg", str(elsewhere), ".hidden/frame_00004.jpg", "mine.jpg", 5):
         layout.frames.write_text(json.dumps([entry | {"names": [name]}]))
         with pytest.raises(UserError, match="frames.json is damaged; remove "):
             video_module.remove_frames(layout)
@@ -129,7 +127,7 @@ def test_frames_go_by_what_they_are_not_by_what_a_record_says(tmp_path, monkeypa
             with contextlib.suppress(UserError):  # what it need not have
                 video_module.describe_videos(layout)
                 video_module.list_report_entries(layout)
-    assert _frame_elsewhere.is_file()
+    assert elsewhere.is_file()
     layout.frames.write_text(json.dumps([entry]))
     Image.open(frames[1]).rotate(90).save(frames[1])
     with pytest.raises(UserError, match="frame_00002.jpg has a name that frames of any.mp4 will get"):
@@ -163,28 +161,27 @@ def _places(room: np.ndarray, frames: list[np.ndarray]) -> list[int]:
     return [int(np.abs(room.astype(np.int16) - frame).mean(axis=(1, 2, 3)).argmin()) for frame in frames]
 
 
-@pytest.mark.parametrize("name", ["12:30.mp4", "-x.mp4", "file,5.mp4", "a%03d.mp4", "concat:a.mp4"])
-def test_names_are_neither_options_nor_addresses(ffmpeg, room, tmp_path, monkeypatch, name):
+def test_names_are_neither_options_nor_addresses(ffmpeg, room, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    _write(ffmpeg, tmp_path / name, room[:2])
-    assert _frames(_extract(tmp_path / "scene", Path(name), 2))
+    for number, name in enumerate(["12:30.mp4", "-x.mp4", "file,5.mp4", "a%03d.mp4", "concat:a.mp4"]):
+        _write(ffmpeg, tmp_path / name, room[:2])
+        assert _frames(_extract(tmp_path / str(number), Path(name), 2)), name
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "ffconcat version 1.0\nfile secret.mp4\n",
-        "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\nsecret.mp4\n#EXT-X-ENDLIST\n",
-        "v=0\no=- 0 0 IN IP4 127.0.0.1\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
-    ],
+LEADING = (
+    "ffconcat version 1.0\nfile secret.mp4\n",
+    "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:1,\nsecret.mp4\n#EXT-X-ENDLIST\n",
+    "v=0\no=- 0 0 IN IP4 127.0.0.1\nc=IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\na=rtpmap:96 H264/90000\n",
 )
-@pytest.mark.parametrize("ending", ["mp4", "m3u8"])
-def test_a_text_does_not_lead_to_other_files(ffmpeg, room, tmp_path, text, ending):
+
+
+def test_a_text_does_not_lead_to_other_files(ffmpeg, room, tmp_path):
     _write(ffmpeg, tmp_path / "secret.mp4", room[:2])
-    (tmp_path / f"a.{ending}").write_text(text)
-    with pytest.raises(UserError, match="cannot read the video .*a.m"):
-        _extract(tmp_path / "scene", tmp_path / f"a.{ending}", 2)
-    assert not list((tmp_path / "scene" / "input").iterdir())
+    for number, (text, ending) in enumerate(itertools.product(LEADING, ("mp4", "m3u8"))):
+        (tmp_path / f"a.{ending}").write_text(text)
+        with pytest.raises(UserError, match="cannot read the video .*a.m"):
+            _extract(tmp_path / str(number), tmp_path / f"a.{ending}", 2)
+        assert not list((tmp_path / str(number) / "input").iterdir())
 
 
 def _streams(ffmpeg, room, path: Path, *heights: int, width: int = 240) -> None:
@@ -197,15 +194,12 @@ def _streams(ffmpeg, room, path: Path, *heights: int, width: int = 240) -> None:
     subprocess.run([*command, *given, "-c", "copy", "-f", "mp4", str(path)], check=True)
 
 
-@pytest.mark.parametrize(
-    ("heights", "folders", "said"),
-    [
-        ((48, 180), {"": 1}, "of its 2 streams, the largest is taken"),
-        ((180, 48), {"": 0}, "of its 2 streams, the largest is taken"),
-        ((180, 180), {"walk": 0, "walk_2": 1}, "each of its 2 streams of one size is a camera"),
-        ((48, 180, 180), {"walk": 1, "walk_2": 2}, "each of its 2 streams of one size is a camera"),
-    ],
-)
+@pytest.mark.parametrize(("heights", "folders", "said"), [
+    ((48, 180), {"": 1}, "of its 2 streams, the largest is taken"),
+    ((180, 48), {"": 0}, "of its 2 streams, the largest is taken"),
+    ((180, 180), {"walk": 0, "walk_2": 1}, "each of its 2 streams of one size is a camera"),
+    ((48, 180, 180), {"walk": 1, "walk_2": 2}, "each of its 2 streams of one size is a camera"),
+])  # fmt: skip
 def test_streams_of_a_video(ffmpeg, room, tmp_path, heights, folders, said):
     _streams(ffmpeg, room, tmp_path / "walk.mp4", *heights)
     layout = _extract(tmp_path / "scene", tmp_path / "walk.mp4", 9)
@@ -296,9 +290,8 @@ def test_hdr_frames_look_like_those_of_the_sdr_video(ffmpeg, room, tmp_path, tra
     # BT.2408 gives white these signals.
     assert SIGNALS[transfer](np.full((1, 3), 203.0)) == pytest.approx({"HLG": 0.75, "PQ": 0.58}[name], abs=0.001)
     _write_hdr(ffmpeg, tmp_path / "hdr.mov", _light(source), transfer)
-    bt709 = (
-        "scale=out_color_matrix=bt709,format=yuv420p,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
-    )
+    tags = "setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
+    bt709 = f"scale=out_color_matrix=bt709,format=yuv420p,{tags}"
     _write(ffmpeg, tmp_path / "sdr.mp4", source, "-crf", "10", "-vf", bt709)
     for kind in ("hdr.mov", "sdr.mp4"):
         layout = _extract(tmp_path / kind[:3], tmp_path / kind, 9)
@@ -312,14 +305,13 @@ def test_hdr_frames_look_like_those_of_the_sdr_video(ffmpeg, room, tmp_path, tra
 
 
 def test_tags_that_are_missing(ffmpeg, room, tmp_path):
-    _write_hdr(
-        ffmpeg, tmp_path / "few.mov", _light(room[:1]), "smpte2084", "color_primaries=unknown:colorspace=unknown"
-    )
-    (path,) = _frames(_extract(tmp_path / "few", tmp_path / "few.mov", 3))
+    few, none = tmp_path / "few.mov", tmp_path / "none.mov"
+    _write_hdr(ffmpeg, few, _light(room[:1]), "smpte2084", "color_primaries=unknown:colorspace=unknown")
+    (path,) = _frames(_extract(tmp_path / "few", few, 3))
     assert np.asarray(Image.open(path)).mean() == pytest.approx(room[0].mean(), rel=0.03)
-    _write_hdr(ffmpeg, tmp_path / "none.mov", _light(room[:1]), "smpte2084", f"{ALL_TAGS}:color_trc=unknown")
+    _write_hdr(ffmpeg, none, _light(room[:1]), "smpte2084", f"{ALL_TAGS}:color_trc=unknown")
     with pytest.raises(UserError, match="none.mov has the colours of HDR .* does not say which transfer function"):
-        _extract(tmp_path / "none", tmp_path / "none.mov", 3)
+        _extract(tmp_path / "none", none, 3)
 
 
 def test_an_ffmpeg_that_can_not_convert_hdr_is_refused(ffmpeg, room, tmp_path, monkeypatch):
@@ -394,10 +386,8 @@ def test_two_videos_and_photos_make_one_scene(ffmpeg, room, tmp_path, capsys):
     assert "12 of 12 photos placed" in said and f"note: {video_module.NOTE}" in said
     content = json.loads(layout.report.read_text())
     assert content["notes"] == [video_module.NOTE] and content["matcher"] == "auto"
-    assert content["videos"] == [
-        {"video": "left.mp4", "frames": 15, "taken": 5, "asked": 150, "hdr": ""},
-        {"video": "right.mp4", "frames": 12, "taken": 4, "asked": 150, "hdr": ""},
-    ]
+    of_each = [[video[key] for key in ("video", "frames", "taken", "asked", "hdr")] for video in content["videos"]]
+    assert of_each == [["left.mp4", 15, 5, 150, ""], ["right.mp4", 12, 4, 150, ""]]
     model = pycolmap.Reconstruction(layout.sparse / "0")
     assert {image.name for image in model.images.values()} >= {"left/frame_00005.jpg", "right/frame_00004.jpg"}
     convert.main(["-s", str(layout.scene), "--no_gpu", *videos])

@@ -1,6 +1,5 @@
 """convert.py --orient: the vertical of horizons and gravity, and the size and north of GPS."""
 
-import json
 import struct
 from pathlib import Path
 
@@ -16,7 +15,6 @@ from applications.convert.orienting import describe_orientation, orient_scene
 from gaussian_renderer.camera_paths.poses import look_along
 from groundwork.files.similarity import Similarity, read_orientation
 from scene.images.exif import _gps, read_place
-from utils.system_utils import UserError
 
 TILT = Rotation.from_rotvec([0.5, 1.3, -0.4]).as_matrix()  # from the level frame (x east, y down, z north) to the world
 UNIT = 0.04  # scene units in a metre
@@ -88,9 +86,8 @@ def converted(folder: Path, turns: np.ndarray, places: np.ndarray, exifs=None) -
     lines = []
     for number, (turn, place) in enumerate(zip(TILT @ turns, UNIT * places @ TILT.T + SHIFT, strict=True)):
         wxyz = Rotation.from_matrix(turn.T).as_quat(scalar_first=True)
-        lines.append(
-            " ".join(map(repr, [number + 1, *wxyz.tolist(), *(-turn.T @ place).tolist()])) + f" 1 {number}.jpg\n\n"
-        )
+        pose = " ".join(map(repr, [*wxyz.tolist(), *(-turn.T @ place).tolist()]))
+        lines.append(f"{number + 1} {pose} 1 {number}.jpg\n\n")
         options = {} if exifs is None else {"exif": exifs[number]}
         Image.new("RGB", (8, 6)).save(layout.input / f"{number}.jpg", **options)
     (layout.sparse / "0" / "images.txt").write_text("".join(lines))
@@ -148,19 +145,14 @@ def _told(gps: np.ndarray, how: str) -> list[np.ndarray | None]:
 
 
 FLIGHTS = [  # pattern, size (m), photos, pitch, GPS, its noise (m), place, whether the vertical is known
-    ("one way", 300, 64, 90, "all", (1, 5), PLACE, True),
     ("one way", 300, 64, 60, "all", (3, 3), PLACE, True),
     ("one way", 300, 100, 90, "an outlier", (3, 5), PLACE, True),
-    ("one way", 100, 30, 90, "all", (1, 0.3), PLACE, True),
     ("one way", 50, 28, 90, "all", (1, 5), PLACE, False),
     ("one way", 300, 64, 90, "no heights", (1, 0), PLACE, False),
     ("one way", 300, 64, 90, "one height", (1, 0), PLACE, False),
-    ("one way", 300, 100, 60, "no", (1, 0), PLACE, False),
-    ("alternating", 50, 28, 90, "all", (1, 5), PLACE, True),
     ("alternating", 300, 28, 90, "half", (2, 5), PLACE, True),
     ("alternating", 300, 28, 70, "no heights", (3, 5), PLACE, True),
     ("alternating", 300, 28, 70, "no", (3, 5), PLACE, True),
-    ("alternating", 300, 28, 90, "no", (3, 5), PLACE, False),
     ("cross", 50, 28, 90, "one height", (1, 5), PLACE, True),
     ("cross", 300, 28, 90, "all", (3, 5), (89.9995, 10.0, 20.0), True),
     ("cross", 300, 28, 45, "all", (3, 5), (-20.0, 180.0, 20.0), True),
@@ -192,14 +184,13 @@ def test_flights_are_level_and_in_metres_or_say_that_they_are_not(
         np.testing.assert_allclose(there[:, ::2], east_north, atol=4)
 
 
-@pytest.mark.parametrize("case", ["two photos", "one place", "noise"])
-def test_gps_that_tells_no_size_is_left_out(tmp_path, case):
+def test_gps_that_tells_no_size_is_left_out(tmp_path):
     turns, places = ring()
-    rng = np.random.default_rng(1)
-    told = {"two photos": places, "one place": 0 * places, "noise": rng.normal(scale=20, size=places.shape)}[case]
-    exifs = [exif_of(gps if case != "two photos" or n < 2 else None) for n, gps in enumerate(gps_of(told))]
-    similarity, record = oriented(converted(tmp_path, turns, places, exifs))
-    assert similarity.scale == 1 and record["unit"] == "scene"
+    noise = np.random.default_rng(1).normal(scale=20, size=places.shape)
+    for name, told, count in (("two photos", places, 2), ("one place", 0 * places, COUNT), ("noise", noise, COUNT)):
+        exifs = [exif_of(gps if n < count else None) for n, gps in enumerate(gps_of(told))]
+        similarity, record = oriented(converted(tmp_path / name, turns, places, exifs))
+        assert similarity.scale == 1 and record["unit"] == "scene", name
 
 
 @pytest.mark.parametrize("orientation", [1, 6, 3, 8])
@@ -220,51 +211,35 @@ def test_gravity_of_a_phone_comes_before_horizons(tmp_path, orientation):
 
 
 @pytest.mark.parametrize("spelling", ['{}="{}"', "{}>{}</"])
-@pytest.mark.parametrize("longitude", ["GpsLongitude", "GpsLongtitude"])
-@pytest.mark.parametrize(
-    ("pitch", "roll", "down"), [(-90, 0, (0, 0, 1)), (0, 0, (0, 1, 0)), (-30, 90, (0.75**0.5, 0, 0.5))]
-)
+@pytest.mark.parametrize(("longitude", "pitch", "roll", "down"), [
+    ("GpsLongitude", -90, 0, (0, 0, 1)), ("GpsLongtitude", 0, 0, (0, 1, 0)),
+    ("GpsLongitude", -30, 90, (0.75**0.5, 0, 0.5)),
+])  # fmt: skip
 def test_drones_tell_place_and_gravity_in_xmp(tmp_path, spelling, longitude, pitch, roll, down):
     values = {"GpsLatitude": "+47.123456789", longitude: "-8.5", "AbsoluteAltitude": "+512.25",
               "GimbalPitchDegree": f"{pitch:+.2f}", "GimbalRollDegree": f"{roll:+.2f}"}  # fmt: skip
     xmp = " ".join(f"drone-dji:{spelling.format(*one)}" for one in values.items()).encode()
-    for orientation in (1, 6):
+    for orientation, found_down in ((1, down), (6, None)):  # it is not known what the angles are then of
         exif = exif_of(np.array([47.1234, -8.5, 480.0]), orientation=orientation)
         Image.new("RGB", (8, 6)).save(tmp_path / "a.jpg", exif=exif, xmp=xmp)
         found = read_place(tmp_path / "a.jpg")
         assert found.gps == (47.123456789, -8.5, 512.25)
-        if orientation == 1:
-            np.testing.assert_allclose(found.down, down, atol=1e-12)
-        else:  # it is not known what the angles are then of
-            assert found.down is None
+        assert found.down == (found_down and pytest.approx(found_down, abs=1e-12))
 
 
-@pytest.mark.parametrize(
-    ("tags", "place"),
-    [
-        ({1: "s", 2: (47.0, 30.0, 36.0), 3: "W ", 4: (8.0, 30.0, 0.0), 5: b"\1", 6: 5.0}, (-47.51, -8.5, -5)),
-        ({1: "South", 2: (47.0, 30.6), 3: b"West\0", 4: 8.5, 5: 1, 6: -5.0}, (-47.51, -8.5, -5)),
-        ({1: "N", 2: (47.0, 30.6, np.nan), 3: "east", 4: (8.5,), 6: 5.0}, (47.51, 8.5, 5)),  # NaN: of 0/0
-        ({2: (-47.0, 30.6), 3: "?", 4: (8.5, np.nan, np.nan), 5: b"\0", 6: np.nan}, (-47.51, 8.5, np.nan)),
-        ({1: "\tS\0", 2: (-47.0, 30.6), 3: "E", 4: (8.5,), 6: (5.0,)}, (-47.51, 8.5, 5)),
-        ({2: (0.0, -30.6), 4: (8.5,), 6: "5 m"}, (-0.51, 8.5, np.nan)),
-        ({2: 47.51, 4: 8.5, 6: np.inf}, (47.51, 8.5, np.nan)),
-        ({1: "N", 2: (np.nan, 0.0, 0.0), 3: "E", 4: (8.5,)}, None),
-        ({1: "N", 2: (47.0, np.nan, 36.0), 3: "E", 4: (8.5,)}, None),
-        ({1: "N", 2: 47.51, 3: "E", 4: 351.5}, (47.51, -8.5, np.nan)),
-        ({1: "N", 2: 47.51, 3: "O", 4: 8.5}, None),  # east of Germans, west of Italians
-        ({1: "N", 2: (), 3: "E", 4: (1.0, 2.0, 3.0, 4.0)}, None),
-    ],
-)
+@pytest.mark.parametrize(("tags", "place"), [
+    ({1: "s", 2: (47.0, 30.0, 36.0), 3: "W ", 4: (8.0, 30.0, 0.0), 5: b"\1", 6: 5.0}, (-47.51, -8.5, -5)),
+    ({1: "South", 2: (47.0, 30.6), 3: b"West\0", 4: 8.5, 5: 1, 6: -5.0}, (-47.51, -8.5, -5)),
+    ({1: "N", 2: (47.0, 30.6, np.nan), 3: "east", 4: (8.5,), 6: 5.0}, (47.51, 8.5, 5)),  # NaN: of 0/0
+    ({2: (-47.0, 30.6), 3: "?", 4: (8.5, np.nan, np.nan), 5: b"\0", 6: np.nan}, (-47.51, 8.5, np.nan)),
+    ({1: "\tS\0", 2: (-47.0, 30.6), 3: "E", 4: (8.5,), 6: (5.0,)}, (-47.51, 8.5, 5)),
+    ({2: (0.0, -30.6), 4: (8.5,), 6: "5 m"}, (-0.51, 8.5, np.nan)),
+    ({2: 47.51, 4: 8.5, 6: np.inf}, (47.51, 8.5, np.nan)),
+    ({1: "N", 2: (47.0, np.nan, 36.0), 3: "E", 4: (8.5,)}, None),
+    ({1: "N", 2: 47.51, 3: "E", 4: 351.5}, (47.51, -8.5, np.nan)),
+    ({1: "N", 2: 47.51, 3: "O", 4: 8.5}, None),  # east of Germans, west of Italians
+    ({1: "N", 2: (), 3: "E", 4: (1.0, 2.0, 3.0, 4.0)}, None),
+])  # fmt: skip
 def test_gps_as_programs_write_it(tags, place):
     found = _gps(tags)
     assert found is None if place is None else found == pytest.approx(place, nan_ok=True)
-
-
-@pytest.mark.parametrize("change", [{"scale": -1}, {"rotation": [[1]]}, {"translation": [0, 0, None]}])
-def test_a_damaged_record_is_refused(tmp_path, change):
-    layout = converted(tmp_path, *ring())
-    _, record = oriented(layout)
-    layout.orientation.write_text(json.dumps(record | change))
-    with pytest.raises(UserError, match=r"orientation\.json has no rotation"):
-        read_orientation(tmp_path)

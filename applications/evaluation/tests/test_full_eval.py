@@ -132,9 +132,7 @@ def test_commands_of_a_plain_scene(figures, evaluate):
     assert first["machine"] == MACHINE and report["published"] == []
     assert (evaluate.out / "timing.txt").read_text().startswith("scenes: 0.0")
     for name in ("attic_psnr.png", "attic_ssim.png", "attic_worst_views.png"):
-        assert f"(figures/{name})" in evaluate.text("md")
-        with Image.open(evaluate.out / "figures" / name) as image:
-            assert image.width > 300
+        assert f"(figures/{name})" in evaluate.text("md") and (evaluate.out / "figures" / name).stat().st_size > 5000
 
 
 def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path, capsys):
@@ -151,60 +149,49 @@ def test_data_sets_get_the_options_of_the_paper(evaluate, tmp_path, capsys):
     assert trained["truck"] == switches
     assert [words[6] for words in log if words[0] == "render"] == ["7000", "30000"] * 10
 
-    report = evaluate.report
+    report, text = evaluate.report, evaluate.text("md")
     assert not any(run["failure"] for run in report["runs"])
     garden = [row for row in report["published"] if row["scene"] == "garden" and row["iteration"] == 30000]
     assert [row["table"].partition(" ")[0] for row in garden] == ["Kerbl", "official", "Deng", "3DGS-MCMC,"]
     assert {(row["photos"], garden[2]["hardware"]) for row in garden} == {("images_4", "RTX 4090 GPU")}
-    assert {entry.options for entry in dataset_scenes("mipnerf360", mip, resize=True)} == {("-r", "4"), ("-r", "2")}
-    assert describe_photos(["--eval", "-r", "4", "--test_iterations", "-1"]) == "images, resized by -r 4"
     assert "LPIPS" not in garden[0]["numbers"] and garden[0]["other_options"] == switches  # our LPIPS is null
     means = {(row["scene"], row["iteration"]) for row in report["published"] if row["scene"].startswith("mean")}
-    assert "images_4, images_2" in [row["photos"] for row in report["published"]]
     assert means == {("mean of mipnerf360", 7000), ("mean of mipnerf360", 30000)}  # Tanks and Temples lacks a scene
     groups = [line.split(":")[0] for line in (evaluate.out / "timing.txt").read_text().splitlines()]
     assert groups == ["mipnerf360", "tanksandtemples"]
-    assert "23.00, 27.41, -4.41" in evaluate.text("md") and "## Beside published numbers" in evaluate.text("md")
+    assert "23.00, 27.41, -4.41" in text and "## Beside published numbers" in text and "images_4, images_2" in text
+    assert {entry.options for entry in dataset_scenes("mipnerf360", mip, resize=True)} == {("-r", "4"), ("-r", "2")}
+    assert describe_photos(["--eval", "-r", "4", "--test_iterations", "-1"]) == "images, resized by -r 4"
 
 
 def test_a_second_call_does_nothing_again(evaluate):
     first, model = evaluate("attic"), evaluate.out / "attic"
     done = evaluate.calls()
-    scorings = lambda: len((model / "scored.txt").read_text().splitlines())  # noqa: E731
-    assert evaluate("attic") == first
-    assert evaluate.calls() == done and scorings() == 1
-
+    assert evaluate("attic") == first and evaluate.calls() == done
     (model / "test" / "ours_40" / "renders" / "00001.png").unlink()
     evaluate("attic")
-    assert [words[0] for words in evaluate.calls()[len(done) :]] == ["render"]
     (model / "results.json").write_text("{}")
     evaluate("attic")
+    assert [words[0] for words in evaluate.calls()[len(done) :]] == ["render"]
     (model / "point_cloud" / "iteration_40" / "point_cloud.ply").unlink()
     evaluate("attic")
-    assert [words[0] for words in evaluate.calls()[len(done) + 1 :]] == ["train", "render"] and scorings() == 4
+    assert [words[0] for words in evaluate.calls()[len(done) + 1 :]] == ["train", "render"]
+    assert len((model / "scored.txt").read_text().splitlines()) == 4
 
 
-def test_weights_are_checked_first_and_give_dists(evaluate, tmp_path, monkeypatch):
+def test_weights_and_stlpips_are_checked_first_and_scored_where_they_were_not(evaluate, tmp_path, monkeypatch):
     assert evaluate("attic")["runs"][0]["iterations"]["40"]["DISTS"] is None and "DISTS" not in evaluate.text("md")
-    done = evaluate.calls()
+    done, checked = evaluate.calls(), []
     with pytest.raises(UserError, match=f"{tmp_path} has no file vgg16-397923af.pth, .* download https://.*vgg16"):
         evaluate("brick", "--weights", tmp_path)
     monkeypatch.setattr(lpips_utils, "weights_file", lambda *_: None)
-    assert evaluate("attic", "--weights", tmp_path)["summary"][0]["DISTS"]["mean"] == 0.125
-    assert evaluate.calls() == done and " DISTS |" in evaluate.text("md")
-    scorings = (evaluate.out / "attic" / "scored.txt").read_text().splitlines()
-    assert len(scorings) == 2 and json.loads(scorings[1])[-1] == f"--weights={tmp_path}"
-
-
-def test_stlpips_is_scored_where_it_was_not(evaluate, monkeypatch):
-    evaluate("attic")
-    checked = []
     monkeypatch.setattr(lpips_utils, "import_stlpips", lambda: checked.append(1))
+    assert evaluate("attic", "--weights", tmp_path)["summary"][0]["DISTS"]["mean"] == 0.125
     for more in (["--stlpips"], []):
         assert evaluate("attic", *more)["summary"][0]["STLPIPS"]["mean"] == 0.25
-    assert checked == [1] and " ST-LPIPS |" in evaluate.text("md")
+    assert evaluate.calls() == done and checked == [1] and " ST-LPIPS |" in evaluate.text("md")
     scorings = (evaluate.out / "attic" / "scored.txt").read_text().splitlines()
-    assert len(scorings) == 2 and json.loads(scorings[1])[-1] == "--stlpips"
+    assert [json.loads(line)[-1] for line in scorings[1:]] == [f"--weights={tmp_path}", "--stlpips"]
 
 
 def test_other_options_are_not_mixed_in(evaluate):
@@ -221,17 +208,16 @@ def test_other_options_are_not_mixed_in(evaluate):
 
 
 def test_a_failed_scene_is_told_and_the_others_go_on(evaluate, capsys):
-    broken = evaluate.scenes / "attic" / "broken"
-    broken.touch()
+    (evaluate.scenes / "attic" / "broken").touch()
     evaluate.fails("attic brick")
     attic, brick = evaluate.report["runs"]
+    said = "error: <b>the scene</b> is broken; fix it"
     assert attic["failure"]["stage"] == "train" and attic["failure"]["command"][1].endswith("train.py")
-    assert attic["failure"]["lines"] == ["error: <b>the scene</b> is broken; fix it"]
+    assert attic["failure"]["lines"] == [said] and f"    {said}" in evaluate.text("md")
     assert brick["finished"] and [row["scene"] for row in evaluate.report["summary"]] == ["brick"]
-    assert "    error: <b>the scene</b> is broken; fix it" in evaluate.text("md")
     assert "&lt;b&gt;the scene&lt;/b&gt; is broken" in evaluate.text("html")
     assert "1 of 2 runs failed: attic" in capsys.readouterr().err
-    broken.unlink()
+    (evaluate.scenes / "attic" / "broken").unlink()
     before = len(evaluate.calls())
     assert evaluate("attic brick")["runs"][0]["finished"]
     assert [words[0] for words in evaluate.calls()[before:]] == ["train", "render"]  # of attic alone
@@ -265,8 +251,7 @@ def test_a_checkpoint_of_a_failure_is_not_resumed(evaluate, capsys):
 
 def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate):
     attic, model = evaluate.scenes / "attic", evaluate.out / "attic"
-    (attic / "slow").touch()
-    model.mkdir(parents=True)
+    (attic / "slow").touch(), model.mkdir(parents=True)
     program = (  # what full_eval.py does of this, without its imports
         "import sys; from pathlib import Path; from groundwork.files.folders import locked; import stand_ins\n"
         "with locked(Path(sys.argv[1]), 'full_eval.py', 'process {process}', '--output_path', inherited=True):\n"
@@ -276,17 +261,15 @@ def test_a_second_one_is_refused_while_the_first_or_its_training_lives(evaluate)
     command = [sys.executable, "-c", program, str(evaluate.out), "-s", str(attic), "-m", str(model)]
     process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": path}, start_new_session=True)
     wait_for(lambda: (attic / "started").exists() or process.poll() is not None)
-    trainer = int((model / "pid").read_text())
     try:
-        with pytest.raises(UserError, match=rf"\(process {process.pid}\).* is running in .*out; wait"):
-            evaluate("attic")
-        process.kill()
-        process.wait()
-        with pytest.raises(UserError, match="is running in"):
-            evaluate("attic")  # the training has outlived it
+        for running in (rf"\(process {process.pid}\).* is running in .*out; wait", "is running in"):
+            with pytest.raises(UserError, match=running):
+                evaluate("attic")
+            process.kill()  # which the training outlives
+            process.wait()
     finally:
         process.kill()
-        os.kill(trainer, signal.SIGKILL)
+        os.kill(int((model / "pid").read_text()), signal.SIGKILL)
 
 
 def test_a_training_that_ends_by_itself(evaluate):
@@ -298,16 +281,14 @@ def test_a_training_that_ends_by_itself(evaluate):
     (row,) = report["summary"]
     assert row["seconds"]["values"] == pytest.approx([17.2, 18.4])  # those of the log at the end
     assert " 43 to 46 |" in evaluate.text("md") and "end by themselves" in evaluate.text("md")
-    done = evaluate.calls()
-
-    saved = evaluate.out / "attic" / "seed_0" / "point_cloud"
-    (saved / "iteration_99").mkdir()  # an earlier attempt of the same training came further
-    (saved / "iteration_99" / "point_cloud.ply").write_text("ply\nelement vertex 1\nend_header\n")
+    done, seed = evaluate.calls(), evaluate.out / "attic" / "seed_0"
+    (seed / "point_cloud" / "iteration_99").mkdir()  # an earlier attempt of the same training came further
+    (seed / "point_cloud" / "iteration_99" / "point_cloud.ply").write_text("ply\nelement vertex 1\nend_header\n")
     assert evaluate(*given)["runs"][0]["final_iteration"] == 43 and evaluate.calls() == done
-    (saved / "iteration_43" / "point_cloud.ply").unlink()
+    (seed / "point_cloud" / "iteration_43" / "point_cloud.ply").unlink()
     assert evaluate(*given)["runs"][0]["final_iteration"] == 43
     assert [words[0] for words in evaluate.calls()[len(done) :]] == ["train", "render"]
-    assert "ours_99" not in [path.name for path in (evaluate.out / "attic" / "seed_0" / "test").iterdir()]
+    assert not (seed / "test" / "ours_99").exists()
 
 
 def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
@@ -319,38 +300,27 @@ def test_what_a_model_folder_tells_beside_its_scores(evaluate, tmp_path):
     (model / "model.json").write_text(json.dumps(left_out))
     names = ["photo_0", "photo_8", *(f"photo_{i}" for i in range(1, 8))]
     (model / "cameras.json").write_text(json.dumps([{"img_name": name} for name in names]))
-    records = json.loads((model / "train_log.json").read_text())
-    records[-1]["lines"] = ["Curve of 14 points", "Saved 9 of 10 Gaussians"]
-    (model / "train_log.json").write_text(json.dumps(records))
-    (second,) = evaluate("attic")["runs"]
-    values = second["iterations"]["40"]
-    assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
-    assert second["split"] == "every 8th by name" and second["lines"] == records[-1]["lines"]
-    text = evaluate.text("md")
-    assert "17,000" in text and "16,000" not in text and "Gaussians are counted as trained" in text
-    assert "every 8th by name" in text and "Curve of" not in text  # of one training, all say the same
     evaluate("brick")
-    records[-1]["lines"] = [f"Curve of 9 points: {evaluate.out}/brick/curve.png", "Its photos differ"]
-    (evaluate.out / "brick" / "train_log.json").write_text(json.dumps(records))
-    records[-1]["lines"] = [f"Curve of 14.5 points: {evaluate.out}/attic/curve.png", "warning: of the start"]
-    (model / "train_log.json").write_text(json.dumps(records))
-    evaluate("attic brick")
+    for name, lines in (
+        ("attic", [f"Curve of 14.5 points: {evaluate.out}/attic/curve.png", "warning: of the start"]),
+        ("brick", [f"Curve of 9 points: {evaluate.out}/brick/curve.png", "Its photos differ"]),
+    ):
+        log = evaluate.out / name / "train_log.json"
+        log.write_text(
+            json.dumps([*json.loads(log.read_text())[:-1], {"iteration": 40, "seconds": 16, "lines": lines}])
+        )
+    attic, brick = evaluate("attic brick")["runs"]
+    values = attic["iterations"]["40"]
+    assert (values["gaussians"], values["gaussians_saved"]) == (17000, 16000)
+    assert attic["split"] == "every 8th by name" and brick["lines"] == lines
     text = evaluate.text("md")
+    assert "17,000" in text and "Gaussians are counted as trained" in text and "every 8th by name" in text
     assert "\nbrick: Its photos differ.\n" in text and "Curve of" not in text and "\nattic: of the start\n" in text
     write_cfg_args(tmp_path, argparse.Namespace())
     assert shorter_ends_there(tmp_path, 1000)  # as a schedule of --iterations does not
     assert not shorter_ends_there(tmp_path, 999)  # whose SH bands are raised sooner
     (tmp_path / SCHEDULE).touch()
     assert not shorter_ends_there(tmp_path, 1000)
-
-
-def test_what_many_trainings_said_stands_once():
-    known = {"scene": "attic", "config": None, "model": "m"}
-    seeds = [known | {"seed": n, "lines": [f"Cut: {0.1**n:g}"]} for n in range(6)]
-    said = report_module._list_closing_lines([*seeds, known | {"seed": 6, "lines": None}])
-    title = "attic, seed 0; attic, seed 1; attic, seed 2; attic, seed 3 and 2 more"
-    assert said == [(title, "Cut: 1, of which others have other numbers")]  # 1e-05, for one
-    assert report_module._list_closing_lines(seeds) == []
 
 
 def test_seeds_of_different_ground_truth(evaluate):
@@ -364,12 +334,10 @@ def test_seeds_of_different_ground_truth(evaluate):
     mask.save(model / "test" / "ours_40" / "masks" / "00001.png")
     (model / "results.json").unlink()
     report = evaluate(*given)
-    (warning,) = report["warnings"]
+    (warning,), (row,) = report["warnings"], report["summary"]
     assert "different ground truth" in warning and warning in evaluate.text("md")
-    (row,) = report["summary"]
     assert not row["one_ground_truth"] and row["PSNR"] == {"mean": None, "std": None, "values": [23.0, 23.1]}
-    assert row["seconds"]["mean"] == 16.0
-    assert report["runs"][1]["worst_views"][0]["file"] == "00001.png"
+    assert row["seconds"]["mean"] == 16.0 and report["runs"][1]["worst_views"][0]["file"] == "00001.png"
 
 
 def test_seeds_and_option_sets(evaluate, tmp_path, capsys):
@@ -384,61 +352,53 @@ def test_seeds_and_option_sets(evaluate, tmp_path, capsys):
     assert "(figures/attic_worst_views.png)" in text
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ("", "no scenes given"),
-        ("--skip_training --skip_rendering", "no scenes given"),
-        ("--scenes SCENES/attic SCENES/attic", "two scenes are named attic"),
-        ("--scenes nowhere", "no such scene folder: nowhere"),
-        ("--scenes SCENES", "scenes is not a scene"),
-        ("--scenes SCENES/attic --iterations 0", "--iterations must be at least 1"),
-        ("--scenes SCENES/attic --seeds 1 1", "--seeds must be distinct"),
-        ("--scenes SCENES/attic --seeds 1 -- --seed 2", "--seed is given twice"),
-        ("--scenes SCENES/attic -- -m elsewhere", "after --: full_eval.py sets -m itself"),
-        ("--scenes SCENES/attic -- --model=elsewhere", "full_eval.py sets --model=elsewhere itself"),
-        ("--scenes SCENES/attic --configs nowhere.json", "cannot read nowhere.json"),
-        ("--scenes SCENES/attic -- --sh_degreee 2", "after --: there is no option --sh_degreee; did you"),
-        ("--scenes SCENES/attic -- -h", "after --: -h trains nothing"),
-        ("--scenes SCENES/attic -- --adv", "after --: --advise trains nothing; give --options auto"),
-        ("--scenes SCENES/attic -- --viewer", "after --: --viewer waits for its page to be closed"),
-        ("--scenes SCENES/attic SCENES/brick --output_path SCENES/brick/eval", "attic would lie in the scene folder"),
-        ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
-        ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
-        ("--scenes SCENES/attic --resize", "--resize works with -m360 only; give -m360, or"),
-        ("-m360 SCENES", "scenes has none of the scenes of mipnerf360; pass the folder that has bicycle"),
-        ("-m360 SCENES/mip", "mip/room has no folder images_2; give --resize, which makes photos of images smaller"),
-        ("--scenes SCENES/attic --peer other nowhere.csv", "cannot read nowhere.csv"),
-    ],
-)
-def test_refusals(evaluate, words, sentence):
+@pytest.mark.parametrize(("words", "sentence"), [
+    ("", "no scenes given"),
+    ("--skip_training --skip_rendering", "no scenes given"),
+    ("--scenes SCENES/attic SCENES/attic", "two scenes are named attic"),
+    ("--scenes nowhere", "no such scene folder: nowhere"),
+    ("--scenes SCENES", "scenes is not a scene"),
+    ("--scenes SCENES/attic --iterations 0", "--iterations must be at least 1"),
+    ("--scenes SCENES/attic --seeds 1 1", "--seeds must be distinct"),
+    ("--scenes SCENES/attic --seeds 1 -- --seed 2", "--seed is given twice"),
+    ("--scenes SCENES/attic -- -m elsewhere", "after --: full_eval.py sets -m itself"),
+    ("--scenes SCENES/attic -- --model=elsewhere", "full_eval.py sets --model=elsewhere itself"),
+    ("--scenes SCENES/attic --configs nowhere.json", "cannot read nowhere.json"),
+    ("--scenes SCENES/attic -- --sh_degreee 2", "after --: there is no option --sh_degreee; did you"),
+    ("--scenes SCENES/attic -- -h", "after --: -h trains nothing"),
+    ("--scenes SCENES/attic -- --adv", "after --: --advise trains nothing; give --options auto"),
+    ("--scenes SCENES/attic -- --viewer", "after --: --viewer waits for its page to be closed"),
+    ("--scenes SCENES/attic SCENES/brick --output_path SCENES/brick/eval", "attic would lie in the scene folder"),
+    ("--scenes SCENES/attic --output_path SCENES/attic --skip_training", "would lie in the scene folder"),
+    ("-m360 SCENES/nowhere", "no such folder: .*nowhere; pass the folder that has bicycle, flowers"),
+    ("--scenes SCENES/attic --resize", "--resize works with -m360 only; give -m360, or"),
+    ("-m360 SCENES", "scenes has none of the scenes of mipnerf360; pass the folder that has bicycle"),
+    ("-m360 SCENES/mip", "mip/room has no folder images_2; give --resize, which makes photos of images smaller"),
+    ("--scenes SCENES/attic --peer other nowhere.csv", "cannot read nowhere.csv"),
+    ("--scenes SCENES/attic --gpus 1 2", "--gpus: this machine has no GPU 2; it has 2, from 0 on"),
+    ("--scenes SCENES/attic --gpus 0", "torch finds none here; leave --gpus out"),
+    ("[" * 100_000, "is not a table of option sets"),
+    ("[]", "names no option sets"),
+    ('{"a": [], "a": []}', "it has a twice"),
+    ('{"../a": []}', "cannot name a folder"),
+    ('{"seed_1": []}', "cannot name a folder"),
+    ('{"a": "--sh_degree 1"}', "a must be a list"),
+    ('{"a": ["-s", "x"]}', "a: full_eval.py sets -s itself"),
+    ('{"a": [], "b": ["--iterations", "many"]}', "json, b: argument --iterations: takes a whole number in digits"),
+    ('{"a": ["--opacity_lr", -1]}', "a: --opacity_lr must be at least 0"),
+    ('{"' + "a" * 300 + '": []}', "the name aaaaaaaaaaaaaaaaaaaa... is too long for a folder"),
+])  # fmt: skip
+def test_refusals(evaluate, tmp_path, monkeypatch, words, sentence):
+    """words: of a call, or the file of option sets."""
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 0 if "torch finds none" in sentence else 2)
     (evaluate.scenes / "mip/room").mkdir(parents=True)
+    if words[:1] in ("[", "{"):
+        (tmp_path / "sets.json").write_text(words)
+        words = f"--scenes SCENES/attic --configs {tmp_path}/sets.json"
     before = folder_state(evaluate.scenes)
     with pytest.raises(UserError, match=sentence):
-        full_eval.main(
-            ["--output_path", str(evaluate.out), *words.replace("SCENES", str(evaluate.scenes)).split()], run
-        )
+        full_eval.main(f"--output_path {evaluate.out} {words.replace('SCENES', str(evaluate.scenes))}".split(), run)
     assert evaluate.calls() == [] and folder_state(evaluate.scenes) == before and not evaluate.out.exists()
-
-
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("[" * 100_000, "is not a table of option sets"),
-        ("[]", "names no option sets"),
-        ('{"a": [], "a": []}', "it has a twice"),
-        ('{"../a": []}', "cannot name a folder"),
-        ('{"seed_1": []}', "cannot name a folder"),
-        ('{"a": "--sh_degree 1"}', "a must be a list"),
-        ('{"a": ["-s", "x"]}', "a: full_eval.py sets -s itself"),
-        ('{"a": [], "b": ["--iterations", "many"]}', "json, b: argument --iterations: takes a whole number in digits"),
-        ('{"a": ["--opacity_lr", -1]}', "a: --opacity_lr must be at least 0"),
-        ('{"' + "a" * 300 + '": []}', "the name aaaaaaaaaaaaaaaaaaaa... is too long for a folder"),
-    ],
-)
-def test_refused_option_sets(evaluate, tmp_path, text, sentence):
-    with pytest.raises(UserError, match=sentence):
-        evaluate("attic", *option_sets(tmp_path, text))
 
 
 def test_a_call_that_scores_nothing_says_so_and_keeps_a_good_report(evaluate, capsys):
@@ -472,8 +432,7 @@ def test_a_second_call_with_other_scenes_or_seeds_joins_the_report(evaluate):
 
 def test_a_second_call_whose_models_would_lie_in_those_of_the_first_is_refused(evaluate, tmp_path):
     sets = option_sets(tmp_path)
-    evaluate("attic")
-    evaluate("brick", *sets, "--seeds", 1)
+    evaluate("attic"), evaluate("brick", *sets, "--seeds", 1)
     before = folder_state(evaluate.out)
     for words in (("attic", "--seeds", 1), ("attic", *sets), ("brick",), ("brick", *sets)):
         with pytest.raises(UserError, match="would be nested; give the same --seeds and --configs, or none"):
@@ -495,9 +454,8 @@ def test_peers_are_shown_and_stay_in_the_report(evaluate, tmp_path):
 def test_names_stay_names_in_the_report(figures, evaluate):
     name = "<script>alert(1)<\n# a[x](javascript:alert(1)) caf\udce9"
     (evaluate.scenes / name / "sparse").mkdir(parents=True)
-    full_eval.main(
-        ["--scenes", str(evaluate.scenes / name), "--output_path", str(evaluate.out), "--iterations", "40"], run
-    )
+    words = ["--scenes", str(evaluate.scenes / name), "--output_path", str(evaluate.out), "--iterations", "40"]
+    full_eval.main(words, run)
     assert evaluate.report["runs"][0]["finished"]
     text = evaluate.text("md")
     assert [evaluate.text(kind).count("<script") for kind in ("md", "html")] == [0, 1]
@@ -506,8 +464,7 @@ def test_names_stay_names_in_the_report(figures, evaluate):
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert len(rows) == 9 and len({line.count("|") for line in rows[:3]}) == 1  # header, rule and row of three tables
     assert not any(line.startswith("# a") for line in text.splitlines())
-    with Image.open(evaluate.out / "figures" / f"{name}_psnr.png") as image:
-        assert image.width > 300
+    assert (evaluate.out / "figures" / f"{name}_psnr.png").stat().st_size > 5000
 
 
 def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeypatch):
@@ -523,9 +480,9 @@ def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeyp
     assert len(shown) == 2 and "<details" in page.split('<figure class="comp')[0]  # on a click
     for figure, name, psnr in zip(shown, ("photo_1.jpg", "photo_0.jpg"), (22, 24), strict=True):
         assert name in figure and f"render: {psnr}.00 dB" in figure and figure.count('<input type="range"') == 1
-        found = re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure)
-        assert [alt for _, alt in found] == ["photo", "render", "error"]
-        images = [Image.open(io.BytesIO(base64.b64decode(text))) for text, _ in found]
+        found = dict(re.findall(r'src="data:image/jpeg;base64,([^"]+)" alt="(\w+)"', figure))
+        assert [*found.values()] == ["photo", "render", "error"]
+        images = [Image.open(io.BytesIO(base64.b64decode(text))) for text in found]
         pixels = [[image.getpixel(place) for place in ((60, 8), (60, 60))] for image in images]
         expected = [[(90, 90, 90)] * 2, [(110, 90, 90), (90, 90, 90)], [(20 * GAIN, 0, 0), (0, 0, 0)]]
         assert np.abs(np.subtract(pixels, expected)).max() <= 6  # of JPEG
@@ -614,10 +571,9 @@ def _signal_once(started: list[Path], sent: signal.Signals = signal.SIGINT, time
     threading.Thread(target=send).start()
 
 
-@pytest.mark.parametrize(
-    ("gpus", "sent", "at_work"),
-    [((), signal.SIGHUP, 1), (("--gpus", 0, 1), signal.SIGINT, 2)],
-)
+@pytest.mark.parametrize(("gpus", "sent", "at_work"), [
+    ((), signal.SIGHUP, 1), (("--gpus", 0, 1), signal.SIGINT, 2),
+])  # fmt: skip
 def test_a_signal_reaches_all_trainings_and_the_next_call_resumes_them(evaluate, two_gpus, gpus, sent, at_work):
     names = ("attic", "brick", "cellar")
     (evaluate.scenes / "cellar" / "sparse").mkdir(parents=True)
@@ -640,25 +596,12 @@ def test_a_signal_reaches_all_trainings_and_the_next_call_resumes_them(evaluate,
 
 def test_a_child_has_its_gpu_its_own_seconds_and_its_own_session(capsys):
     """Its last lines are kept, without progress bars, and shown where it is the only one."""
-    code = (
-        r"import os, sys; sys.stderr.write(' 50%|##  | 5/10\r\n' + os.environ['CUDA_VISIBLE_DEVICES']);"
-        "assert os.getsid(0) == os.getpid()"  # else a terminal's Ctrl-C would reach it twice
-    )
-    for slot, shown in ((Slot("7", DeferredInterrupt()), ""), (None, " 50%|##  | 5/10\r\n4")):
-        done = run_child([sys.executable, "-c", code], "", slot, **({} if slot else {"CUDA_VISIBLE_DEVICES": "4"}))
-        assert (done.status, done.lines, capsys.readouterr().err) == (0, ["7" if slot else "4"], shown)
+    code = r"import os, sys; sys.stderr.write(' 50%|##  | 5/10\r\n' + os.environ['CUDA_VISIBLE_DEVICES']);"
+    code += "assert os.getsid(0) == os.getpid()"  # else a terminal's Ctrl-C would reach it twice
+    for slot, gpu, shown in ((Slot("7", DeferredInterrupt()), "7", ""), (None, "4", " 50%|##  | 5/10\r\n4")):
+        done = run_child([sys.executable, "-c", code], "", slot, **({} if slot else {"CUDA_VISIBLE_DEVICES": gpu}))
+        assert (done.status, done.lines, capsys.readouterr().err) == (0, [gpu], shown)
         assert 0 < done.cpu_seconds < 30
-
-
-@pytest.mark.parametrize(
-    ("count", "sentence"),
-    [(2, "--gpus: this machine has no GPU 2; it has 2, from 0 on"), (0, "torch finds none here; leave --gpus out")],
-)
-def test_a_gpu_that_is_not_there_is_refused(evaluate, monkeypatch, count, sentence):
-    monkeypatch.setattr("torch.cuda.device_count", lambda: count)
-    with pytest.raises(UserError, match=sentence):
-        evaluate("attic", "--gpus", 0 if count == 0 else 1, 2)
-    assert not evaluate.out.exists()
 
 
 def test_views_without_a_psnr_are_on_no_sheet(tmp_path):

@@ -32,14 +32,9 @@ class Cameras(SimpleNamespace):
 
 
 def one_camera(model=0, distortion=()):
-    pose = np.eye(3, 4, dtype=np.float32)
-    return {
-        "poses": pose,
-        "intrinsics": np.array([50.0, 55.0, 33.0, 23.0]),
-        "camera_models": np.array(model),
-        "distortion_parameters": np.array(distortion),
-        "image_sizes": np.array([64, 48]),
-    }
+    sizes, intrinsics = np.array([64, 48]), np.array([50.0, 55.0, 33.0, 23.0])
+    lens = {"camera_models": np.array(model), "distortion_parameters": np.array(distortion)}
+    return lens | {"poses": np.eye(3, 4, dtype=np.float32), "intrinsics": intrinsics, "image_sizes": sizes}
 
 
 def dataset(views=4):
@@ -51,16 +46,10 @@ def dataset(views=4):
     photos[..., 3] = 255
     photos[:, :, 40:, 3] = 0
     grid = np.stack(np.meshgrid(np.linspace(-2, 2, 12), np.linspace(-2, 2, 10), [4.0]), -1).reshape(-1, 3)
-    return {
-        "cameras": cameras,
-        "images": list(photos),
-        "image_paths": [f"/data/{i}.png" for i in range(views)],
-        "image_paths_root": "/data",
-        "masks": None,
-        "points3D_xyz": grid.astype(np.float32),
-        "points3D_rgb": np.full(grid.shape, 128, np.uint8),
-        "metadata": {"background_color": np.full(3, 255, np.uint8)},
-    }
+    paths = {"image_paths": [f"/data/{i}.png" for i in range(views)], "image_paths_root": "/data"}
+    points = {"points3D_xyz": grid.astype(np.float32), "points3D_rgb": np.full(grid.shape, 128, np.uint8)}
+    metadata = {"background_color": np.full(3, 255, np.uint8)}
+    return {"cameras": cameras, "images": list(photos), "masks": None, "metadata": metadata, **paths, **points}
 
 
 @pytest.fixture
@@ -112,11 +101,10 @@ def test_a_loaded_model_renders_the_same_and_is_saved_as_the_same_files(method, 
         assert path.read_bytes() == (tmp_path / "second" / path.relative_to(tmp_path / "first")).read_bytes()
 
 
-@pytest.mark.parametrize(
-    "given",
-    [("keep_unseen", True), ("keep_unseen", "true"), ("options", "auto"), ("advise", True),
-     ("resolution", 4), ("viewer", 8080), ("checkpoint_iterations", 7), ("start_checkpoint", "chkpnt7.pth")],
-)  # fmt: skip
+@pytest.mark.parametrize("given", [
+    ("keep_unseen", True), ("keep_unseen", "true"), ("options", "auto"), ("advise", True), ("resolution", 4),
+    ("viewer", 8080), ("checkpoint_iterations", 7), ("start_checkpoint", "chkpnt7.pth"),
+])  # fmt: skip
 def test_options_that_nothing_would_follow_are_refused(method, given):
     with pytest.raises(method.UserError, match=f"--{given[0]} {given[1]} has no effect in NerfBaselines"):
         method.words_of(dict([given]))

@@ -6,7 +6,7 @@ import json
 import math
 import socket
 import sys
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -76,22 +76,16 @@ def local():
         yield served
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
+def test_no_request_reads_a_file_but_the_page(local):
+    page = get(local.port, "/")[2]
+    for path in (
         "/../../etc/passwd", "/..%2f..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", "//etc/passwd",
         "/..\\..\\etc\\passwd", "/%252e%252e/etc/passwd", "/etc/passwd%00", "http://127.0.0.1/../../etc/passwd",
         "/assets/../../../_viser.py",
-    ],
-)  # fmt: skip
-def test_no_request_reads_a_file_but_the_page(local, path):
-    try:
-        status, _, body = get(local.port, path)
-    except (http.client.HTTPException, OSError):
-        return  # the connection was closed without an answer
-    page = get(local.port, "/")[2]
-    assert status != 200 or body == page
-    assert b"root:" not in body and b"import " not in body[:2000]
+    ):  # fmt: skip
+        with contextlib.suppress(http.client.HTTPException, OSError):  # closed without an answer
+            status, _, body = get(local.port, path)
+            assert (status != 200 or body == page) and b"root:" not in body and b"import " not in body[:2000], path
 
 
 def test_other_sites_that_a_browser_has_open_reach_nothing(local):
@@ -120,15 +114,13 @@ def test_a_taken_port_is_passed_over_and_told(capfd):
     with contextlib.ExitStack() as taking:
         with contextlib.suppress(OSError):  # another program may have it already
             taking.enter_context(socket.create_server(("127.0.0.1", 65535)))
-        with pytest.raises(UserError, match="port 65535 .* taken"):
-            servers.check_port(65535)
-    with pytest.raises(UserError, match="between 0 .any. and 65535, got 70000"):
-        servers.check_port(70_000)
+        for port, said in ((65535, "port 65535 .* taken"), (70_000, "between 0 .any. and 65535, got 70000")):
+            with pytest.raises(UserError, match=said):
+                servers.check_port(port)
 
 
 def test_without_viser_a_sentence_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
-    assert f'"viewer": ["{servers.VISER}"]' in (Path(__file__).parents[3] / "setup.py").read_text()
     with pytest.raises(UserError, match=f"pip install {servers.VISER}"):
         servers.check_port(8080)
     servers.check_port(None)
@@ -176,26 +168,21 @@ def test_each_browser_gets_pictures_of_its_own_camera(page, monkeypatch):
         assert _answered(page, one).shape == (40, 60, 3)  # coarse while it moves
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [{"size": (0, 0)}, {"size": (-5, 1e18)}, {"position": (0.0, 0.0, 0.0)}, {"position": (1e18, 0.0, 0.0)}],
-    ids=["no window", "an endless window", "at what it looks at", "far away"],
-)
+@pytest.mark.parametrize("wrong", [
+    {"size": (0, 0)}, {"size": (-5, 1e18)}, {"position": (0.0, 0.0, 0.0)}, {"position": (1e18, 0.0, 0.0)},
+], ids=["no window", "an endless window", "at what it looks at", "far away"])  # fmt: skip
 def test_a_browser_of_any_window_and_place_goes_to_a_camera(page, capfd, wrong):
-    name = next(iter(page.images._cameras.by_name))
-    page.images.camera.value = next(reversed(page.images._cameras.by_name))
+    cameras, heard = page.images._cameras.by_name, {}
+    name, *_, page.images.camera.value = cameras
     with Client(page.url) as client:
         client.look(**wrong)
         wait_for(page.server.get_clients)
         _set(client, page.images.camera, name)
-        camera = page.images._cameras.by_name[name]
-        place = camera_center(camera.R, camera.T)
-        heard = {}
         while not {"SetCameraPositionMessage", "SetCameraFovMessage"} <= heard.keys():
             heard |= {message["type"]: message for message in client.messages() if not message.get("initial")}
-        assert heard["SetCameraPositionMessage"]["position"] == pytest.approx(place)
-        assert 0 < heard["SetCameraFovMessage"]["fov"] < math.pi
-    assert "Traceback" not in capfd.readouterr().err
+    place = camera_center(cameras[name].R, cameras[name].T)
+    assert heard["SetCameraPositionMessage"]["position"] == pytest.approx(place)
+    assert 0 < heard["SetCameraFovMessage"]["fov"] < math.pi and "Traceback" not in capfd.readouterr().err
 
 
 def test_a_frame_that_cannot_be_drawn_is_told_once_until_one_can_and_ends_nothing(page, monkeypatch, capfd):
@@ -317,13 +304,12 @@ def test_the_line_between_photo_and_render_is_dragged_where_both_are_shown(page)
             x, _, z = (np.asarray(line.position) - place) @ np.asarray(camera.R)
             return x / z if z > 0 else math.nan
 
-        wait_for(lambda: across() == pytest.approx(0, abs=1e-6))
-        assert line.visible
-        drag = {"phase": "update", "name": "/divider", "instance_index": None, "button": "left", "modifier": None}
-        drag |= {"start_position": [0, 0, 0], "end_position": [0, 0, 0], "start_screen_pos": [0.5, 0.5]}
-        drag |= {"end_screen_pos": [0.625, 0.5], "owner": line._impl.api._owner_id}
+        wait_for(lambda: line.visible and across() == pytest.approx(0, abs=1e-6))
+        drag = {"name": "/divider", "instance_index": None, "button": "left", "modifier": None}
+        drag |= {"start_position": [0] * 3, "end_position": [0] * 3}
+        drag |= {"start_screen_pos": [0.5, 0.5], "end_screen_pos": [0.625, 0.5]}
         for phase in ("start", "update"):
-            client.send("SceneNodeDragMessage", **drag | {"phase": phase})
+            client.send("SceneNodeDragMessage", **drag, phase=phase, owner=line._impl.api._owner_id)
         wait_for(lambda: images.slider.value == pytest.approx(0.75))  # the photo has half of the window's width
         wait_for(lambda: across() == pytest.approx(0.5 * math.tan(camera.FoVx / 2), rel=1e-3))
         client.look(place + 0.1, wxyz, size=(192, 64))
@@ -366,13 +352,12 @@ def test_a_path_is_saved_with_the_command_of_its_video_and_what_fails_is_red(pag
 
 def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path, capsys):
     places = np.float32([[-1, 0.5, 0], [1, 0.5, 0], [0, 0.5, 2], [0, -0.5, 1]])
-    (tmp_path / "scene").mkdir()
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/model.json").write_text("{}")
+    out, scene = tmp_path / "out", tmp_path / "scene"
+    scene.mkdir(), out.mkdir(), (out / "model.json").write_text("{}")
     gaussians = model_of(_make_spheres(places, np.ones((4, 3), np.float32), 0.05))
     gaussians.world_offset = (10.0, 0.0, 0.0)
-    shown = WithoutScene(gaussians, str(tmp_path / "out"), 7, circle_cameras(places))
-    page = Page(ANY, shown, pipeline(), False, False, oriented=str(tmp_path / "scene"))
+    shown = WithoutScene(gaussians, str(out), 7, circle_cameras(places))
+    page = Page(ANY, shown, pipeline(), False, False, oriented=str(scene))
     tab = page.measure
     with Client(page.url) as client:
         client.look()
@@ -389,37 +374,37 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
                 answer(page)
                 assert len(tab.points[tool]) == number
 
+        def press(button: object, done: Callable[[], bool], title: str) -> None:
+            _set(client, button, True)
+            wait_for(done)
+            assert client.until("NotificationShowMessage")["props"]["title"] == title
+
         click("A length", (0, 1))
         assert tab.length == pytest.approx(2, abs=1e-2) and "units of the scene" in tab.says.content
         assert tab.keep.disabled
+        with pytest.raises(UserError, match="nothing to set right"):
+            tab.write()
         page.frames.surface = None
-        tab.add("A length", places[0])
         page._find(None, places[0], lambda point: tab.add("A length", point))  # as on a full GPU
         answer(page)
         assert "There is no surface" in tab.says.content and client.until("NotificationShowMessage")["props"]["title"]
         del page.frames.surface
         tab.points["A length"] = [places[0], places[1]]
-        with pytest.raises(UserError, match="nothing to set right"):
-            tab.write()
         tab.metres.value = 5.0
         wait_for(lambda: not tab.keep.disabled)
         click("The ground", (0, 1, 2))
         assert "tilted by 0." in tab.says.content
         click("The front", (2, 1))
-        _set(client, tab.keep, True)
-        wait_for(lambda: (tmp_path / "scene/orientation.json").is_file() and "5 m" in tab.says.content)
-        assert client.until("NotificationShowMessage")["props"]["title"] == "Set right"
-        record = read_orientation(tmp_path / "scene")
+        press(tab.keep, lambda: (scene / "orientation.json").is_file() and "5 m" in tab.says.content, "Set right")
+        record = read_orientation(scene)
         for point in ([0, 0, 0], [1, 0.2, 0], [0.0, 0.0, 1.0]):
             tab.add("The ground", np.array(point))
         assert "tilted by 11.3 degrees in the photos" in tab.says.content
         tab.write()
-        assert read_orientation(tmp_path / "scene") != record
-        _set(client, tab.back, True)
-        wait_for(lambda: read_orientation(tmp_path / "scene") == record)
-        assert client.until("NotificationShowMessage")["props"]["title"] == "As before"
+        assert read_orientation(scene) != record
+        press(tab.back, lambda: read_orientation(scene) == record, "As before")
     page.stop()
-    assert recorded_similarity(str(tmp_path / "out"), "")["similarity"] == record
+    assert recorded_similarity(str(out), "")["similarity"] == record
     found = Similarity.read(record, "here").from_local(np.array([10.0, 0, 0]))
     assert found.metric and found.scale == pytest.approx(2.5, rel=1e-2)
     moved = found.transform(places)
@@ -429,28 +414,21 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
 
 
 def test_what_is_measured_spares_another_orientation_of_the_scene(tmp_path):
-    record = {
-        "rotation": np.eye(3).tolist(),
-        "scale": 2.0,
-        "translation": [0, 0, 0],
-        "unit": "metre",
-        "vertical": "GPS",
-    }
-    for where, content in (("model.json", {"similarity": record | {"scale": 3.0}}), ("orientation.json", record)):
-        (tmp_path / where).write_text(json.dumps(content))
+    model, scene = tmp_path / "model.json", tmp_path / "orientation.json"
+    record = {"rotation": np.eye(3).tolist(), "scale": 2.0, "translation": [0, 0, 0]}
+    record |= {"unit": "metre", "vertical": "GPS"}
+    first = {"similarity": record | {"scale": 3}}
+    model.write_text(json.dumps(first)), scene.write_text(json.dumps(record))
     place = Place(tmp_path, str(tmp_path), (0.0, 0.0, 0.0))
-    for scale in (5.0, 4.0):
-        assert place.write(record | {"scale": scale}) == [tmp_path / "model.json"]
-    assert json.loads((tmp_path / "orientation.json").read_text()) == record
-    assert json.loads((tmp_path / "model.json").read_text())["similarity"]["scale"] == 4
+    for scale in (5, 4):
+        assert place.write(record | {"scale": scale}) == [model]
+        assert json.loads(model.read_text())["similarity"]["scale"] == scale
     for scale in (5, 3):
-        assert place.restore() == [tmp_path / "model.json"] and place.record["scale"] == scale
-    assert json.loads((tmp_path / "model.json").read_text()) == {"similarity": record | {"scale": 3}}
-    (tmp_path / "model.json").write_text("{}")
-    (tmp_path / "orientation.json").unlink()
+        assert place.restore() == [model] and place.record["scale"] == scale
+    assert json.loads(model.read_text()) == first and json.loads(scene.read_text()) == record
+    model.write_text("{}"), scene.unlink()
     place = Place(tmp_path, str(tmp_path), (0.0, 0.0, 0.0))
     place.write(record)
-    (tmp_path / "model.json").write_text(json.dumps({"similarity": record, "antialiasing": True}))  # by a training
+    model.write_text(json.dumps({"similarity": record, "antialiasing": True}))  # by a training
     place.restore()
-    assert not (tmp_path / "orientation.json").exists() and place.record is None
-    assert json.loads((tmp_path / "model.json").read_text()) == {"antialiasing": True}
+    assert not scene.exists() and place.record is None and json.loads(model.read_text()) == {"antialiasing": True}
