@@ -1,9 +1,7 @@
-"""A training run: scene, model, objective and density control, made and checked before a file is written."""
+"""A training run as a record: what the loop and its observers share, and what an iteration asks."""
 
 import argparse
-import copy
 import math
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, field
@@ -16,184 +14,31 @@ import torch
 from torch import Tensor
 
 from arguments import add_to_model_json, write_cfg_args
-from gaussian_renderer.rays import check_views
 from groundwork.deterministic.counter_rng import Stream, uniform
 from groundwork.files.json_files import SCHEDULE
 from groundwork.files.similarity import ENTRY, read_orientation
 from groundwork.host.clock import seconds_since_start
 from groundwork.host.energy import joules_counter, nvml_name
 from groundwork.host.interrupt import DeferredInterrupt
-from groundwork.ranks.ranks import Ranks, ranks
-from scene.checks.scene import check_scene
-from scene.fused_adam import FusedAdam
+from groundwork.ranks.ranks import Ranks
 from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam, SparseGaussianAdam
-from scene.gaussians.checkpoint import extra_state, load_checkpoint, with_extra_state
-from scene.gaussians.morton import sort_rows
+from scene.gaussians.checkpoint import with_extra_state
 from scene.gaussians.sh_bands import SH_INTERVAL
 from scene.scene import Scene
-from scene.sleeping import Sleeping, saves_time
-from scene.splats.splats import Splats
-from scene.with_splats import scene_with, start_from
+from scene.sleeping import Sleeping
 from splatting import folder
-from splatting.agreement import agree_on_scene
-from splatting.checks import check_alone, check_native, check_viewer, warnings_of
 from splatting.iteration import Iteration, OwnSize, ViewOrder
 from splatting.objective import LossWatch, Objective
 from splatting.part import Part, Strategy
 from splatting.records.error_curve import Row
 from splatting.records.training_log import Stopwatch, TrainingLog
-from splatting.registry import check_together, chosen, in_order, states_in, strategies, strategy_part
 from splatting.resources import announce_memory
-from splatting.resume import warn_of_finished
-from splatting.resume_photos import order_views
 from splatting.save import Checkpoints
 from splatting.schedule import USUAL, Schedule
-from splatting.spill import announce, make_storage, release_torch
+from splatting.spill import announce, release_torch
 from splatting.trim_report import TrimReport, trimmed
-from splatting.watch import DivergenceWatch, check_drawn
-from utils.system_utils import UserError, compute_device
-
-
-def make_run(
-    dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
-) -> "Run":
-    """Make a run of these options. Refuse what can be refused (UserError); nothing is written.
-
-    launch: the options of arguments/launch.py.
-    """
-    given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
-    group, device = ranks(), compute_device()
-    check_alone(pipe, launch, group.several)
-    start = group.broadcast_object(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
-    check_native(dataset)  # before auto becomes native
-    dataset = folder.resolve_lenses(dataset, start)
-    if opt.strategy == "auto" and start:
-        opt.strategy = folder.strategy_of(start)
-    gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-    # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
-    capture, done = load_checkpoint(start, mapped=group.several) if start else (None, 0)
-    states = states_in(extra_state(capture)) if capture else {}
-    parts = chosen(together := _joined(launch, dataset, opt, pipe), states, done)
-    check_together(parts, together, group.several)
-    schedule = _make_schedule(parts, opt, start, done, states)
-    gaussians.storage = make_storage(gaussians, opt, device, any(one.takes_absolute(opt) for one in strategies()))
-    check_viewer(launch)
-    if schedule.is_over(done):
-        raise UserError(schedule.nothing_left(start, done))
-
-    init_ply = None if start else getattr(dataset, "init_ply", None)
-    scene, splats = scene_with(init_ply, dataset, gaussians, ranks=group, parts=parts)
-    gaussians.enlargement = folder.enlargement_of(start, gaussians.enlargement)
-    check_scene(scene, dataset, bool(start))
-    agree_on_scene(scene, start)  # before an image is shared
-    gaussians.divide(group)
-    if gaussians.storage:
-        rows = capture[1] if capture else scene.info.point_cloud.points if splats is None else splats
-        gaussians.storage.reserve(-(-len(rows) // group.size), scene)
-    views = ViewOrder(scene.getTrainCameras(), opt.seed)
-    run = Run(dataset, opt, pipe, launch, group, device, start, done, parts, schedule, scene, gaussians, views)
-    run.decode_ahead(done + 1)
-
-    _begin_model(run, capture, splats, states)
-    check_views(pipe, scene.getTrainCameras(), run.sizes.smallest)
-    check_views(pipe, scene.getTestCameras())
-    if capture is None:
-        check_drawn(run)
-    _compare_with_earlier_runs(run)
-    run.strategy = _begin_strategy(run, states)
-    run.objective = Objective(run)
-    run.warnings = [f"warning: {text}" for text in warnings_of(run, given)]
-    for text in run.warnings:
-        print(text, file=sys.stderr)
-    _place(run, states.get("sleep"))
-    warn_of_finished(run)
-    run.watch, run.checkpoints = DivergenceWatch(run), Checkpoints(run)
-    return run
-
-
-def _joined(*groups: argparse.Namespace) -> argparse.Namespace:
-    """Return the options of all groups; a later group goes before an earlier one."""
-    return argparse.Namespace(**{name: value for group in groups for name, value in vars(group).items()})
-
-
-def _make_schedule(
-    parts: Sequence[Part], opt: argparse.Namespace, start: str | None, done: int, states: dict[str, Any]
-) -> Schedule:
-    """Return the schedule of a part, or the steady one.
-
-    A paced run has few iterations, and needs the last ones to train the Gaussians that it has. So densification ends by
-    default at a part of the schedule, where it would end with the schedule.
-    """
-    found = [part.make_schedule(opt, start, done, states.get(part.name)) for part in parts]
-    schedule = next(filter(None, found), None) or Schedule(opt.iterations)
-    if schedule.paced:
-        for name, share in {strategy.until for strategy in strategies()}:
-            if getattr(opt, name) >= opt.iterations:
-                setattr(opt, name, int(share * opt.iterations))
-    return schedule
-
-
-def _begin_model(run: "Run", capture: tuple | None, splats: Splats | None, states: dict[str, Any]) -> None:
-    """Start the model from the state of a checkpoint, from a file's splats, or from the dataset's points."""
-    scene, gaussians = run.scene, run.gaussians
-    if capture is not None:
-        gaussians.start_exposures(scene.info.train_cameras)
-        gaussians.restore(capture, run.opt)
-    elif splats is not None:
-        start_from(splats, scene, gaussians)
-    else:
-        scene.create_gaussians()
-        run.starts_from_points = True
-    for part in run.parts:
-        part.begin(run, states.get(part.name))
-    if capture is None:
-        gaussians.training_setup(run.opt)
-        sort_rows(gaussians)
-    run.parts = [part for part in run.parts if part.active]
-    order_views(run, states.get("resume"))
-    gaussians.limit_columns()
-
-
-def _compare_with_earlier_runs(run: "Run") -> None:
-    """Compare a run with earlier ones, in its folder and beside its checkpoint."""
-    saves, checkpoints = map(run.schedule.known, (run.launch.save_iterations, run.launch.checkpoint_iterations))
-    folder.check_folder(run.options, saves, run.start, run.first_iteration, checkpoints)
-    if run.start:
-        folder.report_changes(run.start, run.options, run.has_new_photos)
-
-
-def _begin_strategy(run: "Run", states: dict[str, Any]) -> Strategy:
-    """Choose the strategy by the option, the schedule or the model, and add it to the parts."""
-    opt = run.opt
-    if opt.strategy == "auto":
-        opt.strategy = run.schedule.best_strategy(run, strategies())
-    run.schedule.strategy = opt.strategy
-    strategy = strategy_part(opt.strategy)
-    run.parts = in_order([*run.parts, strategy])
-    check_together(run.parts, _joined(run.launch, run.options), run.group.several)
-    strategy.begin(run, states.get(strategy.name))
-    return strategy
-
-
-def _place(run: "Run", asleep: Any) -> None:
-    """Put cameras where they are trained, rows where there is room for those to come, and blocks to sleep.
-
-    asleep: state of the blocks in the checkpoint, or None.
-    """
-    strategy, gaussians, storage = run.strategy, run.gaussians, run.gaussians.storage
-    if run.camera_steps:
-        run.camera_steps.place()  # now that parts have measured where cameras were
-    if storage:
-        storage.reserve(-(-strategy.max_gaussians // run.group.size), run.scene)
-    dense = type(gaussians.optimizer) is GaussianAdam and FusedAdam.takes(gaussians)
-    if not dense or strategy.queues or any(strategy.penalty) or not run.is_standard:
-        return  # a step concerns rows that its view does not see
-    spills = run.group.any_rank(storage is not None and storage.limit > 0)
-    if spills or saves_time(run.scene, run.device):
-        run.sleeping = Sleeping(gaussians)
-        if asleep is not None:
-            run.sleeping.restore(asleep)
+from splatting.watch import DivergenceWatch
 
 
 @dataclass(eq=False)
@@ -269,7 +114,7 @@ class Run:
     @property
     def options(self) -> argparse.Namespace:
         """The options of the groups model, optimisation and pipeline, as they are in force."""
-        return _joined(self.dataset, self.opt, self.pipe)
+        return join_options(self.dataset, self.opt, self.pipe)
 
     @property
     def entries(self) -> dict[str, Any]:
@@ -471,6 +316,11 @@ class Run:
             "want_absolute_gradient": at.density.observe and self.strategy.takes_absolute(self.opt),
             "clamp": False,
         }
+
+
+def join_options(*groups: argparse.Namespace) -> argparse.Namespace:
+    """Return the options of all groups; a later group goes before an earlier one."""
+    return argparse.Namespace(**{name: value for group in groups for name, value in vars(group).items()})
 
 
 def overrides(parts: Sequence[Part], hook: str) -> list[Callable]:

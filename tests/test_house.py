@@ -32,6 +32,7 @@ FLOORS = (
     ("splatting.commands",),
     ("splatting.loop",),
     ("splatting.faster", "splatting.log"),
+    ("splatting.make_run",),
     ("splatting.run",),
     ("splatting.checks",),
     ("splatting.registry",),
@@ -191,9 +192,9 @@ def test_functions_are_short_in_c_plus_plus():
 CEILINGS = {
     "lines of the day's list": 6_900,
     "files of the day's list": 55,
-    "lines of an iteration": 900,
+    "lines of an iteration": 850,
     "files of an iteration": 6,
-    "imports of an iteration beside the day's list": 30,
+    "imports of an iteration beside the day's list": 31,
     "lines of the core": 39_000,
 }
 NO_CORE = {"applications", "benchmarks", "tests", "emulation"}

@@ -104,7 +104,7 @@ def test_another_strategy_is_another_object(colmap_scene, tmp_path, monkeypatch)
             assert self._gaussians.get_xyz.grad is None
             calls.append(("after_step", step.iteration))
 
-    monkeypatch.setattr("splatting.run.strategy_part", lambda name: Other())
+    monkeypatch.setattr("splatting.make_run.strategy_part", lambda name: Other())
     told = []
     _train(colmap_scene, tmp_path, monkeypatch, lambda *_: [Recorder(told)])
     steps = range(1, ITERATIONS + 1)

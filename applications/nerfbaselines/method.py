@@ -27,7 +27,8 @@ from splatting.loop import training_steps
 from splatting.part import Part
 from splatting.records import training_log
 from splatting.registry import PARTS
-from splatting.run import Run, make_run
+from splatting.make_run import make_run
+from splatting.run import Run
 from splatting.watch import MaskWatch
 from utils.system_utils import UserError, compute_device, saved_ply
 

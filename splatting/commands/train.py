@@ -23,7 +23,7 @@ from splatting.folder import folder_of, new_folder, own_folder, records_kept, re
 from splatting.loop import run_training, standard_observers
 from splatting.registry import PARTS, check_together, chosen
 from splatting.resume import choose_checkpoint
-from splatting.run import make_run
+from splatting.make_run import make_run
 from splatting.scores import training_report
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, mkdir_p
