@@ -202,8 +202,7 @@ void by_kind_of_rows(const Scene<float>& s, const Run& run) {
 }
 template <class Run>
 void by_kind(const Scene<float>& s, const Run& run) {
-  if (s.rows() && s.rays() == kLensRays) return run(std::integral_constant<int, kLensRays>());
-  by_kind_of_rows(s, run);
+  if (s.rows()) by_rays(s.rays(), run);
 }
 
 }  // namespace
