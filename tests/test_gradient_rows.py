@@ -81,9 +81,6 @@ class Forward:
     def rows_vjp(self, rows: Rows, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
         return ops.rasterize_vjp(*self.scene, wanted, self.source(rows), absolute=absolute)
 
-    def add_rows_vjp(self, rows: Rows, sums: list[Tensor], absolute: bool) -> None:
-        ops.apply_gradients_(*self.scene.lists, self.source(rows), [], sums, None, [], [], [], [], absolute=absolute)
-
     def lists_vjp(self, absolute: bool, wanted: list[bool] = WANTED) -> tuple[Tensor, ...]:
         return ops.rasterize_vjp(*self.scene, wanted, self.kept(self.lists, self.blended), *self.planes, absolute)
 
@@ -153,54 +150,6 @@ def test_rows_give_the_gradients_of_the_lists_and_bands_the_rows_of_the_image(ki
     if kind == "giants":
         assert rows.counts[40] == ACROSS * DOWN and got[1].count_nonzero() > 100
         assert (got[0][40, 2] > 0) == absolute
-
-
-@BOTH_AND_GPU
-@SCENES
-@pytest.mark.parametrize("absolute", [False, True])
-def test_gradients_are_added_to_those_of_another_view(kind, absolute, device, dtype):
-    forward = Forward.of(*scene_of(kind, device, dtype), True)
-    rows, seen = forward.rows(absolute), forward.projected[3] > 0
-    for wanted in ([name in ("means", "sh_rest") for name in GRADIENTS], WANTED):
-        found, expected = forward.rows_vjp(rows, absolute, wanted), []
-        sums = [torch.full_like(gradient, 0.3) for gradient in found]
-        for name, before, gradient in zip(GRADIENTS, sums, found, strict=True):
-            after = before.clone()
-            after[: len(gradient)][seen[: len(gradient)]] += gradient[seen[: len(gradient)]]
-            if name == "means2d" and absolute and len(gradient):
-                after[:, 2] = gradient[:, 2]  # lengths have no place in a sum
-            expected.append(after)
-        forward.add_rows_vjp(rows, sums, absolute)
-        # Another kernel may round products in another way.
-        close = [
-            torch.allclose(*pair, rtol=1e-5, atol=1e-6, equal_nan=True) for pair in zip(sums, expected, strict=True)
-        ]
-        assert all(close), dict(zip(GRADIENTS, close, strict=True))
-        if device == "cpu":
-            assert all(same_bits(*pair) for pair in zip(sums, expected, strict=True))
-
-
-@BOTH_AND_GPU
-@pytest.mark.parametrize("given", [False, True], ids=["no bands of SH", "covariances and colours"])
-def test_gradients_of_other_parameters_are_added(given, device, dtype):
-    raw, camera = scene_of("many", device, dtype)
-    parameters, camera = raw | {"sh_rest": raw["sh_rest"][:, :0]}, camera._replace(sh_degree=0)
-    if given:
-        generator, count = torch.Generator().manual_seed(4), len(raw["means"])
-        covariances = torch.zeros(count, 6)
-        covariances[:, [0, 3, 5]] = 0.01 + 0.05 * torch.rand(count, 3, generator=generator)
-        colors = torch.rand(count, 3, generator=generator)
-        shape = {"opacities": torch.full((count, 1), 0.6), "cov3d": covariances, "colors": colors}
-        parameters = {"means": raw["means"]} | {name: t.to(device, dtype) for name, t in shape.items()}
-    forward = Forward.of(parameters, camera, False, activated=given)
-    rows = forward.rows(False)
-    found = forward.rows_vjp(rows, False, [name in ("means2d", *parameters) for name in GRADIENTS])
-    sums = [gradient.clone() for gradient in found]
-    forward.add_rows_vjp(rows, sums, False)
-    assert given or sums[-1].shape == (300, 0, 3)
-    for twice, once in zip(sums, found, strict=True):
-        torch.testing.assert_close(twice, 2 * once, rtol=1e-5, atol=1e-6)
-    assert all(found[GRADIENTS.index(name)].count_nonzero() > 100 for name in parameters if name != "sh_rest")
 
 
 @CPU_AND_GPU

@@ -226,11 +226,6 @@ WRONG = {
         (ValueError, r"awake must be \(1,\)", {"sleep": _changed(0, lambda t: t.repeat(2))}),
         (ValueError, r"terms must be \(128, 8\)", {"sleep": _changed(2, lambda t: t[1:])}),
     ],
-    "apply_gradients_ to sums": [
-        (ValueError, "sums must have 9 tensors, got 8", {"sums": lambda t: t[:8]}),
-        (ValueError, r"the sum of means must be \(3, 3\)", {"sums": _changed(1, lambda t: t[1:])}),
-        (ValueError, "the sum of means must be contiguous", {"sums": _changed(1, _transposed)}),
-    ],
     "apply_gradients_": [
         (RuntimeError, "for each of the 6 attributes, got 5", {"rates": [0.1] * 5}),
         (RuntimeError, "two for each of the 6 attributes, got 11", {"averages": lambda t: t[1:]}),

@@ -124,8 +124,7 @@ struct Projected {
   const T* table = nullptr;  // of a lens with rays (math/lens_pixels.h), here and below
 };
 
-// Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted. Every row is
-// written; or those of Gaussians that were seen are added to what is there, and no other is touched.
+// Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted.
 template <class T>
 struct SceneGradient {
   T* means;
@@ -137,7 +136,6 @@ struct SceneGradient {
   T* colors;
   T* sh_dc;
   T* sh_rest;
-  bool adds = false;
 };
 
 // The slots (math/slots.h) of a splat: one for each tile of its rectangle, row by row. A culled splat has none.
