@@ -86,7 +86,7 @@ class FusedAdam:
         gaussians, view, *options = scene.lists
         view = view if awake is None else (*view, awake)
         # By place: names would cost the operator microseconds.
-        arguments = source, planes, [], radii, *self.arguments(observe), now, absolute, camera
+        arguments = source, planes, radii, *self.arguments(observe), now, absolute, camera
         OPERATORS.apply_gradients_(gaussians, view, *options, *arguments)
 
     def write_now(self, now: Tensor, iteration: int) -> None:

@@ -134,14 +134,14 @@ def step_plainly(state: State, camera: GaussianRasterizationSettings, case: Case
 def step_fused(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step inside the backward."""
     scene, kept, planes, radii = rendered(state, camera, case, iteration)
-    ops.apply_gradients_(*scene.lists, kept, planes, [], radii=radii, **named(case, state, iteration))
+    ops.apply_gradients_(*scene.lists, kept, planes, radii=radii, **named(case, state, iteration))
 
 
 def step_from_rows(state: State, camera: GaussianRasterizationSettings, case: Case, iteration: int) -> None:
     """Take the same step from gradient rows."""
     scene, kept, planes, radii = rendered(state, camera, case, iteration)
     source = *kept[:2], *ops.blend_rows(kept, *planes, case.absolute)
-    ops.apply_gradients_(*scene.lists, source, [], [], radii=radii, **named(case, state, iteration))
+    ops.apply_gradients_(*scene.lists, source, [], radii=radii, **named(case, state, iteration))
 
 
 def named(case: Case, state: State, iteration: int) -> dict:
@@ -164,7 +164,7 @@ def step_recorded(state: State, camera: GaussianRasterizationSettings, case: Cas
     wrong = {"steps": [t + 5 for t in steps], "rates": [2.0 * rate for rate in rates], "iteration": 77}
     wrong["constants"] = [0.5, 0.5, 1.0, *case.penalties]
     given = named(case, state, iteration) | wrong | {"now": host.to(radii.device)}
-    ops.apply_gradients_(*scene.lists, kept, planes, [], radii=radii, **given)
+    ops.apply_gradients_(*scene.lists, kept, planes, radii=radii, **given)
 
 
 def same_bytes(one: Tensor, other: Tensor) -> bool:

@@ -24,10 +24,10 @@ from scene.saved_model import find_save, read_model
 from splatting.commands.train import parse
 from splatting.iteration import Iteration
 from splatting.loop import training_steps
+from splatting.make_run import make_run
 from splatting.part import Part
 from splatting.records import training_log
 from splatting.registry import PARTS
-from splatting.make_run import make_run
 from splatting.run import Run
 from splatting.watch import MaskWatch
 from utils.system_utils import UserError, compute_device, saved_ply

@@ -81,7 +81,7 @@ class TrainingStep:
         _, _, kept = torch.ops.fused_ssim.photometric(drawn.color, self._photo, 0.2, True)
         gradient = torch.ops.fused_ssim.photometric_vjp(drawn.color, self._photo, kept, 0.2, self._one)
         source = drawn.kept(camera.bg)
-        OPS.apply_gradients_(*scene.lists, source, [gradient], [], drawn.radii, *self._adam)
+        OPS.apply_gradients_(*scene.lists, source, [gradient], drawn.radii, *self._adam)
 
 
 # Of a training step: kernels that begin a stage, and those behind which another one begins.

@@ -21,9 +21,9 @@ from splatting.agreement import agree_on_options
 from splatting.events import summary_writer
 from splatting.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
 from splatting.loop import run_training, standard_observers
+from splatting.make_run import make_run
 from splatting.registry import PARTS, check_together, chosen
 from splatting.resume import choose_checkpoint
-from splatting.make_run import make_run
 from splatting.scores import training_report
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, mkdir_p

@@ -41,7 +41,6 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
     shaped = torch.where(counts[:, None] > 0, splats, -torch.inf)
     wanted = [True, True, True, True, True, False, False, True, True]
     source = [splats, counts, *rows]
-    sums = list(ops.rasterize_vjp(*scene, wanted, source))
     lists = [[rand(3, 3), rand(2, 5)] for _ in range(4)]
     guard = [rand(()), torch.zeros(1, dtype=torch.int64, device=device), 3]
     adam = [*lists, [torch.tensor(1.0), torch.tensor(7.0)], [0.1, 0.2], 0.9, 0.99, 1e-8, [2, -1], None, *guard]
@@ -78,9 +77,8 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
         "rasterize_vjp of moments": (ops.rasterize_vjp, [*scene, wanted, [splats, counts, moments]]),
         "camera_vjp": (ops.camera_vjp, [*scene, source]),
         "sum_blocks": (ops.sum_blocks, [torch.rand(3, 5, device=device, dtype=torch.float64)]),
-        "apply_gradients_": (ops.apply_gradients_, [*in_lists, state, planes, [], *step]),
-        "apply_gradients_ of rows": (ops.apply_gradients_, [*in_lists, source, [], [], *step]),
-        "apply_gradients_ to sums": (ops.apply_gradients_, [*in_lists, source, [], sums, None, [], [], [], []]),
+        "apply_gradients_": (ops.apply_gradients_, [*in_lists, state, planes, *step]),
+        "apply_gradients_ of rows": (ops.apply_gradients_, [*in_lists, source, [], *step]),
         "wake_": (ops.wake_, _wake(in_lists, step)),
         "decisive": (ops.decisive, [splats, instances, ranges, last]),
         "adam_": (ops.adam_, adam),
@@ -114,7 +112,7 @@ def sound_calls(device: str = "cpu", dtype: torch.dtype = torch.float32) -> dict
 
 
 def _step(raw: dict[str, Tensor], guard: list) -> list:
-    """The arguments of `apply_gradients_` behind `sums`."""
+    """The arguments of `apply_gradients_` behind `planes`."""
     count = len(raw["means"])
     averages = [torch.rand_like(value) for _ in range(2) for value in raw.values()]
     counters = [torch.tensor(float(place)) for place in range(6)]

@@ -2,6 +2,7 @@
 // The plain structs of pointers and sizes that math and every backend share. N Gaussians, W x H image, I instances (a
 // splat in a tile). All arrays are row-major and contiguous unless a stride is given; T is float or double.
 #include <cstdint>
+#include <type_traits>
 
 #include "gs/hd.h"
 
@@ -46,6 +47,13 @@ constexpr Dilation<T> dilation_of(double area, double floor = kUsualFloor) {
 
 // How pixels see Gaussians: by EWA, or on their rays (math/ray.h), those of a pinhole or of a lens (math/lens_rays.h).
 enum Rays : int { kNoRays, kPinholeRays, kLensRays };
+// Returns run(rays) with a constant.
+template <class Run>
+auto by_rays(Rays rays, const Run& run) {
+  return rays == kLensRays ? run(std::integral_constant<int, kLensRays>())
+         : rays            ? run(std::integral_constant<int, kPinholeRays>())
+                           : run(std::integral_constant<int, kNoRays>());
+}
 
 // The Gaussians and the camera. The tensors come in the order of Input in torch/scene.h.
 template <class T>
@@ -116,8 +124,7 @@ struct Projected {
   const T* table = nullptr;  // of a lens with rays (math/lens_pixels.h), here and below
 };
 
-// Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted. Every row is
-// written; or those of Gaussians that were seen are added to what is there, and no other is touched.
+// Gradients of the inputs that have one, in the order of Input in torch/scene.h; null where not wanted.
 template <class T>
 struct SceneGradient {
   T* means;
@@ -129,7 +136,6 @@ struct SceneGradient {
   T* colors;
   T* sh_dc;
   T* sh_rest;
-  bool adds = false;
 };
 
 // The slots (math/slots.h) of a splat: one for each tile of its rectangle, row by row. A culled splat has none.

@@ -18,6 +18,14 @@ inline void run_serially(int64_t n, int64_t /*grain*/, const std::function<void(
 }
 inline Executor serial_executor() { return {1, &run_serially}; }
 
+// Calls body(row) for each of n rows, of which a thread takes `grain` or more at a time.
+template <class Body>
+void for_each_row(const Executor& executor, int64_t n, int64_t grain, const Body& body) {
+  executor.run(n, grain, [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) body(row);
+  });
+}
+
 // Calls body(begin, end) on blocks of fixed size; each free thread takes the next block. For uneven work.
 template <class Body>
 void for_dynamic(const Executor& executor, int64_t n, int64_t block, const Body& body) {

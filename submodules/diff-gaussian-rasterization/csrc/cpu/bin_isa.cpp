@@ -121,10 +121,7 @@ void write_tiles(const Projected<T>& in, int32_t i, Image image, int32_t* tiles)
     for (int32_t tile = rect.y0 * columns + rect.x0; left; tile += columns, left = left >> (wide - 1) >> 1)
       for (uint64_t bits = left & row; bits; bits &= bits - 1) *tiles++ = tile + __builtin_ctzll(bits);
   } else {
-    const auto list = in.rays == kLensRays ? list_again<T, kLensRays>
-                      : in.rays            ? list_again<T, kPinholeRays>
-                                           : list_again<T, kNoRays>;
-    list(in, i, rect, image, tiles);
+    by_rays(in.rays, [&](auto rays) { list_again<T, rays>(in, i, rect, image, tiles); });
   }
 }
 

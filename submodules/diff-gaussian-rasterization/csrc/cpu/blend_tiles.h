@@ -134,7 +134,7 @@ bool blend_strip(const Chunk<T, kChunk, kRays>& chunk, const Strip<T, kRays>& st
   V sums[kWidth<kPayload>];
   for (int c = 0; c < kWidth<kPayload>; ++c) sums[c] = S::load(state.payload[c] + at);
   const bool open = blend_weights<T, kLast>(chunk, strip, position, further.cap(), state, [&](int k, V weight) {
-    for (int c = 0; c < kWidth<kPayload>; ++c) sums[c] = S::multiply_add(weight, V{} + chunk.payload[c][k], sums[c]);
+    for (int c = 0; c < kWidth<kPayload>; ++c) sums[c] = S::multiply_add(weight, S::all(chunk.payload[c][k]), sums[c]);
     if constexpr (kPayload == kChannels) further.weigh(position + k, weight);
   });
   if constexpr (kPayload == kChannels)

@@ -115,9 +115,7 @@ __attribute__((always_inline)) inline void sum_rows(const Batch<T, kRays>& batch
       const V alpha = capped<V, T>(uncapped, further.cap());
       V left = S::load(state.transmittance + at), behind = S::load(state.behind + at);
       V gradient[kWidth<kPayload>];
-      for (int c = 0; c < kWidth<kPayload>; ++c) gradient[c] = S::load(state.payload[c] + at);
-      if (!state.finite)
-        for (V& of_pixels : gradient) of_pixels = reached ? of_pixels : zero;
+      for (int c = 0; c < kWidth<kPayload>; ++c) gradient[c] = reached ? S::load(state.payload[c] + at) : zero;
       V value = chunk.payload[0][k] * gradient[0];
       for (int c = 1; c < kWidth<kPayload>; ++c) value += chunk.payload[c][k] * gradient[c];
       if constexpr (kPayload == kChannels) value = further.value(value, at);
@@ -248,10 +246,11 @@ void read_state(const BlendInput<T>& in, const BlendGradient<T>& g, const Tile& 
   }
   read_ends(in, g, tile, index, state);
   interleave<T>(state.behind);
-  typename Simd<T>::Vec none = {};  // every gradient but an inverse depth's is a part of `behind`
-  for (int p = 0; p < kPixels; p += Simd<T>::kLanes)
-    none += 0 * Simd<T>::load(state.behind + p) + 0 * Simd<T>::load(state.payload[3] + p);
-  state.finite = !Simd<T>::any(none != none);
+  if constexpr (kPayload == kChannels) {
+    typename Simd<T>::Vec none = {};  // the gradient of each channel is a part of `behind`
+    for (int p = 0; p < kPixels; p += Simd<T>::kLanes) none += 0 * Simd<T>::load(state.behind + p);
+    further.finite = !Simd<T>::any(none != none);
+  }
 }
 
 template <class T, int kRays, int kPayload, bool kAbsolute>
@@ -279,7 +278,7 @@ void blend_tile_vjp(const BlendInput<T>& in, const BlendGradient<T>& g, int64_t 
       if constexpr (kPayload == kChannels) {
         T sums[kSums<kRays, kAbsolute>];
         further.start(splat), sum_into(sums);
-        further.store(sums, pass, rows.number(slot), rows.row(slot), state.finite);
+        further.store(sums, pass, rows.number(slot), rows.row(slot));
       } else {
         sum_into(rows.row(slot));
       }

@@ -13,9 +13,7 @@ template <class T>
 void add_rows(const Scene<T>& s, const Camera<T>& camera, const int32_t* tile_counts, const T* moments, double* sum) {
   using V = typename Simd<T>::Vec;
   int32_t seen[kVjpBlock];
-  SceneGradient<T> none{};
-  none.adds = true;
-  for_packs<T>(seen, list_seen(s, tile_counts, none, seen), [&](const Pack<T>& pack) {
+  for_packs<T>(seen, list_seen(s, tile_counts, {}, seen), [&](const Pack<T>& pack) {
     V m[kGradientValues], rest[kMostRest], g[kPinholeNumbers];
     read_rows(moments, kGradientValues, s.count, kGradientValues, pack, m);
     SceneLanes<T> row(s, pack);

@@ -64,7 +64,7 @@ class FurtherPlanes<T, kChannels> {
     V sums[kCount];
     for (int c = 0; c < kCount; ++c) sums[c] = S::load(to + c * kPixels);
     for (int i = 0; i < count_; ++i)
-      for (int c = 0; c < kCount; ++c) sums[c] = S::multiply_add(weights_[i], V{} + rows_[i][first + c], sums[c]);
+      for (int c = 0; c < kCount; ++c) sums[c] = S::multiply_add(weights_[i], S::all(rows_[i][first + c]), sums[c]);
     store(first, sums, to);
   }
 
@@ -72,7 +72,7 @@ class FurtherPlanes<T, kChannels> {
     for (int64_t c = first; c < end; ++c, to += kPixels) {
       V sum = S::load(to);
       for (int i = 0; i < count_; ++i)
-        sum = weights_[i] > 0 ? S::multiply_add(weights_[i], V{} + rows_[i][c], sum) : sum;
+        sum = weights_[i] > 0 ? S::multiply_add(weights_[i], S::all(rows_[i][c]), sum) : sum;
       S::store(to, sum);
     }
   }
@@ -108,6 +108,8 @@ class FurtherSums<T, kChannels> {
   explicit FurtherSums(const Channels<T>& channels)
       : channels_(channels), end_(channels.stops ? channels.cap : std::numeric_limits<T>::infinity()) {}
 
+  bool finite = true;  // whether all gradients of the tile are
+
   T cap() const { return channels_.cap; }
   T* plane(int64_t channel) { return planes_[channel - kLeading]; }
 
@@ -116,21 +118,20 @@ class FurtherSums<T, kChannels> {
   // `value` and what these channels add to the loss, at a vector of pixels.
   V value(V value, int at) const {
     for (int64_t c = kLeading; c < channels_.count; ++c)
-      value = S::multiply_add(V{} + values_[c], S::load(planes_[c - kLeading] + at), value);
+      value = S::multiply_add(S::all(values_[c]), S::load(planes_[c - kLeading] + at), value);
     return value;
   }
   V slope(V q, V uncapped) const { return uncapped > end_ ? V{} : q; }
   void weigh(int at, V weight) { reached_[count_++] = {weight, at}; }
 
-  // Puts the splat's sums into its row, which is number `number`, and into that of its channels. finite:
-  // BackwardState's.
+  // Puts the splat's sums into its row, which is number `number`, and into that of its channels.
   template <int kRow>
-  void store(T (&sums)[kRow], const PassRows<T>& pass, int64_t number, T* row, bool finite) const {
+  void store(T (&sums)[kRow], const PassRows<T>& pass, int64_t number, T* row) const {
     constexpr int kFirst = kGradientValues - kLeading;  // of the channels
     if (pass.channels) {
       T* to = pass.channels + kMostChannels * number;
       std::copy_n(sums + kFirst, kLeading, to);
-      for (int64_t c = kLeading; c < channels_.count; c += kGroup) store_group(c, to, finite);
+      for (int64_t c = kLeading; c < channels_.count; c += kGroup) store_group(c, to);
     }
     sums[kGradientValues - 1] = 0;  // a channel is no inverse depth
     for (int v = 0; v < kRow; ++v) {
@@ -146,7 +147,7 @@ class FurtherSums<T, kChannels> {
     int at;
   };
 
-  void store_group(int64_t first, T* to, bool finite) const {  // planes beyond the last one are zero
+  void store_group(int64_t first, T* to) const {  // planes beyond the last one are zero
     V sums[kGroup] = {};
     const auto gradient = [&](int i, int c) { return S::load(planes_[first - kLeading + c] + reached_[i].at); };
     if (finite)

@@ -13,43 +13,24 @@ constexpr int64_t kVjpBlock = kSleepBlock;  // Gaussians whose gradients, some 3
 
 template <class T>
 SceneGradient<T> part_of(const SceneGradient<T>& g, int64_t first, int rest_bands) {
-  return {from_row(g.means, first, 3),
-          from_row(g.means2d, first, 3),
-          from_row(g.opacities, first, 1),
-          from_row(g.scales, first, 3),
-          from_row(g.rotations, first, 4),
-          from_row(g.cov3d, first, 6),
-          from_row(g.colors, first, 3),
-          from_row(g.sh_dc, first, 3),
-          from_row(g.sh_rest, first, 3 * rest_bands),
-          g.adds};
+  return {from_row(g.means, first, 3),  from_row(g.means2d, first, 3),   from_row(g.opacities, first, 1),
+          from_row(g.scales, first, 3), from_row(g.rotations, first, 4), from_row(g.cov3d, first, 6),
+          from_row(g.colors, first, 3), from_row(g.sh_dc, first, 3),     from_row(g.sh_rest, first, 3 * rest_bands)};
 }
 
-// Lists the Gaussians that were seen. Zeroes the gradients of the others, unless gradients are added.
+// Lists the Gaussians that were seen. Zeroes the gradients of the others.
 template <class T>
 int64_t list_seen(const Scene<T>& s, const int32_t* tile_counts, const SceneGradient<T>& out, int32_t* seen) {
   int64_t found = 0;
   for (int64_t i = 0; i < s.count; ++i) {
     if (tile_counts[i]) {
       seen[found++] = int32_t(i);
-    } else if (!out.adds) {
+    } else {
       zero_gradient(i, out);
       if (out.sh_rest) std::memset(out.sh_rest + 3 * s.rest_bands * i, 0, 3 * s.rest_bands * sizeof(T));
     }
   }
   return found;
-}
-
-// Writes the values of a pack's Gaussians to rows of a gradient of n Gaussians, or adds them.
-template <class T>
-void write_or_add(typename Simd<T>::Vec* values, int row, int64_t n, const Pack<T>& pack, bool adds, T* to) {
-  if (!to) return;
-  if (adds) {
-    typename Simd<T>::Vec before[kMostRest];
-    read_rows(to, row, n, row, pack, before);
-    for (int k = 0; k < row; ++k) values[k] = before[k] + values[k];
-  }
-  write_rows(values, row, row, pack, to);
 }
 
 template <class T>
@@ -67,8 +48,10 @@ struct PackGradient {
     return {means, means2d, opacities, scales, rotations, s.cov3d ? cov3d : nullptr, colors, sh_dc, nullptr};
   }
 
-  void write(const Scene<T>& s, const Pack<T>& pack, const SceneGradient<T>& out) {
-    const auto write = [&](V* values, int row, T* to) { write_or_add(values, row, s.count, pack, out.adds, to); };
+  void write(const Pack<T>& pack, const SceneGradient<T>& out) {
+    const auto write = [&](V* values, int row, T* to) {
+      if (to) write_rows(values, row, row, pack, to);
+    };
     write(means, 3, out.means), write(means2d, 3, out.means2d), write(opacities, 1, out.opacities);
     write(scales, 3, out.scales), write(rotations, 4, out.rotations), write(cov3d, 6, out.cov3d);
     write(colors, 3, out.colors), write(sh_dc, 3, out.sh_dc);
@@ -89,8 +72,8 @@ GS_ONE_COPY void project_vjp_rows(const Scene<T>& s, const AnyCamera& camera, co
     row.read_colors(s, pack, rest);
     PackGradient<T> gradient{};
     project_vjp_row(s, camera, row, m, rest, rest, gradient.pointers(s), 0);
-    gradient.write(s, pack, out);
-    write_or_add(rest, 3 * s.rest_bands, s.count, pack, out.adds, out.sh_rest);
+    gradient.write(pack, out);
+    if (out.sh_rest) write_rows(rest, 3 * s.rest_bands, 3 * s.rest_bands, pack, out.sh_rest);
   });
 }
 

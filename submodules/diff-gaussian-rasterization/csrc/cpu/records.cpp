@@ -15,9 +15,8 @@ bool reaches(const RecordInput& in, int64_t i, int band) {
 
 template <class Body>
 void for_blocks(const Executor& executor, const RecordInput& in, const Body& body) {
-  executor.run(record_blocks(in.count), 16, [&](int64_t first, int64_t last) {
-    for (int64_t block = first; block < last; ++block)
-      body(block, kRecordBlock * block, std::min(kRecordBlock * (block + 1), in.count));
+  for_each_row(executor, record_blocks(in.count), 16, [&](int64_t block) {
+    body(block, kRecordBlock * block, std::min(kRecordBlock * (block + 1), in.count));
   });
 }
 

@@ -57,7 +57,6 @@ struct BackwardState {
   alignas(64) T payload[kLeading][kPixels];  // the image's gradient
   alignas(64) typename IntOf<T>::type last[kPixels];
   alignas(64) typename IntOf<T>::type row_last[kTile];  // the largest in a row
-  bool finite;                                          // whether all gradients are
 };
 
 // The columns that each splat of a chunk can reach, first <= column <= last; the exact test follows. As in tile_rect,

@@ -17,19 +17,17 @@ void sum_runs(const Executor& executor, const SumInput<T>& in) {
   const auto place = [&](int64_t i) { return in.places ? int64_t(in.places[i]) : i; };
   for (int64_t i = 0; i < in.runs; ++i) begins[i + 1] = begins[i] + in.counts[i], new_begins[place(i) + 1] = in.kept[i];
   for (int64_t i = 0; i < in.runs; ++i) new_begins[i + 1] += new_begins[i];
-  executor.run(in.runs, 4096, [&](int64_t first, int64_t end) {
-    for (int64_t i = first; i < end; ++i) {
-      const T *from = in.from + in.values * begins[i], *stop = in.from + in.values * begins[i + 1];
-      T* to = in.to + in.values * new_begins[place(i)];
-      if (in.kept[i] != 1) {
-        std::copy_n(from, in.values * int64_t(in.kept[i]), to);
-        continue;
-      }
-      double sums[kGradientValues + kAbsoluteValues] = {};
-      for (; from < stop; from += in.values)
-        for (int v = 0; v < in.values; ++v) sums[v] += from[v];
-      std::copy_n(sums, in.values, to);
+  for_each_row(executor, in.runs, 4096, [&](int64_t i) {
+    const T *from = in.from + in.values * begins[i], *stop = in.from + in.values * begins[i + 1];
+    T* to = in.to + in.values * new_begins[place(i)];
+    if (in.kept[i] != 1) {
+      std::copy_n(from, in.values * int64_t(in.kept[i]), to);
+      return;
     }
+    double sums[kGradientValues + kAbsoluteValues] = {};
+    for (; from < stop; from += in.values)
+      for (int v = 0; v < in.values; ++v) sums[v] += from[v];
+    std::copy_n(sums, in.values, to);
   });
 }
 

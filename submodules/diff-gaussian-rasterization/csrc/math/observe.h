@@ -3,6 +3,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "../data.h"
 #include "gs/rounded.h"
 
 namespace gs {
@@ -29,6 +30,16 @@ GS_HD void observe(int32_t radius, float length, Observed& o) {
   if (float(radius) > o.max_radius) o.max_radius = float(radius);
   o.gradient_sum += length;
   o.views += 1;
+}
+
+// Adds a view to the statistics of Gaussian i, of which the view has row `at`.
+GS_HD void observe(const ObserveInput& in, int64_t i, int64_t at) {
+  Observed o{in.max_radii[i], in.gradient_sums[i], in.views[i]};
+  if (in.lengths)
+    observe(in.radii[at], in.lengths[at], o);
+  else
+    observe(in.radii[at], in.gradients[3 * at], in.gradients[3 * at + 1], o);
+  in.max_radii[i] = o.max_radius, in.gradient_sums[i] = o.gradient_sum, in.views[i] = o.views;
 }
 
 }  // namespace gs

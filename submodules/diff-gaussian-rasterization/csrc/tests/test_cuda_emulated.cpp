@@ -617,24 +617,14 @@ void emulated_gradients(const gs::Queue& queue, const Rendered& r, gs::SceneGrad
   gs::cuda::rasterize_vjp(queue, r.scene, r.input, backward, {as_given, &g});
 }
 
-// Gradients from rows, once written and once added to numbers, are the same.
-std::vector<float> gradients_from_rows(const gs::Queue& queue, const Rendered& r, const KeptRows& rows,
-                                       float* lengths) {
-  GradientsInMemory<float> gradient(r.scene.count), sums(r.scene.count);
-  std::fill(sums.memory.begin(), sums.memory.end(), 0.25f);
-  sums.pointers.adds = true;
-  for (GradientsInMemory<float>* to : {&gradient, &sums})
-    gs::cuda::rows_vjp(queue, r.scene, rows.given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
-                       {as_given, &to->pointers});
-  for (size_t k = 0; k < sums.memory.size(); ++k) CHECK(sums.memory[k] == 0.25f + gradient.memory[k]);
-  return gradient.memory;
-}
-
 // Gradients of the emulated backward, from rows or from the lists.
 std::vector<float> gradients_from(const gs::Queue& queue, const Rendered& r, const KeptRows* rows, float* lengths) {
-  if (rows) return gradients_from_rows(queue, r, *rows, lengths);
   GradientsInMemory<float> gradient(r.scene.count);
-  emulated_gradients(queue, r, gradient.pointers, lengths);
+  if (rows)
+    gs::cuda::rows_vjp(queue, r.scene, rows->given(r), {r.splats.data(), r.scene.image, nullptr, lengths},
+                       {as_given, &gradient.pointers});
+  else
+    emulated_gradients(queue, r, gradient.pointers, lengths);
   return gradient.memory;
 }
 

@@ -201,13 +201,13 @@ Tensor absolute_like(const SceneTensors& scene, bool wanted) {
 
 namespace {
 
-Gradients vjp_into(const SceneTensors& scene, const GradientSource& source, const Tensor& lengths,
-                   const std::function<SceneGradients()>& make) {
+Gradients vjp_and_lengths(const SceneTensors& scene, const GradientSource& source, const Tensor& lengths,
+                          const Wanted& wanted) {
 #ifdef GS_CUDA
   if (scene.device().is_cuda()) {
     gs::TorchQueue queue(scene.device(), halted());
     std::optional<SceneGradients> out;
-    auto allocate = [&] { return out.emplace(make()).template pointers<float>(); };
+    auto allocate = [&] { return out.emplace(scene, wanted).template pointers<float>(); };
     using Allocate = decltype(allocate);
     const gs::cuda::GradientMemory memory{[](void* context) { return (*static_cast<Allocate*>(context))(); },
                                           &allocate};
@@ -217,7 +217,7 @@ Gradients vjp_into(const SceneTensors& scene, const GradientSource& source, cons
   }
 #endif
   const Tensor moments = source.moments(lengths);
-  SceneGradients out = make();
+  const SceneGradients out(scene, wanted);
   with_scalar(scene.dtype(), [&](auto zero) {
     using T = decltype(zero);
     GS_DISPATCH(project_vjp, gs::torch_executor(), scene.scene<T>(), read<int32_t>(source.tile_counts()),
@@ -228,10 +228,9 @@ Gradients vjp_into(const SceneTensors& scene, const GradientSource& source, cons
 
 }  // namespace
 
-Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths,
-              const std::function<SceneGradients()>& make) {
+Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths, const Wanted& wanted) {
   const Tensor absolute = absolute_like(scene, lengths);
-  Gradients all = vjp_into(scene, source, absolute, make);
+  Gradients all = vjp_and_lengths(scene, source, absolute, wanted);
   if (lengths) {
     Tensor column = torch::stable::select(std::get<kMeans2d>(all), 1, 2);
     torch::stable::copy_(column, absolute);

@@ -1,7 +1,5 @@
 #pragma once
 // What a backward takes, as tensors: what the forward has kept, the gradients of the image, or gradient rows.
-#include <functional>
-
 #include "scene.h"
 
 #define SOURCE_SCHEMA \
@@ -160,9 +158,8 @@ void check_camera_gradients(const SceneTensors& scene);
 // Memory for the lengths of absolute gradients; undefined if they are not wanted.
 Tensor absolute_like(const SceneTensors& scene, bool wanted);
 
-// The gradients of a scene in what `make` allocates. lengths: whether the third value of a row of means2d becomes the
-// length of its absolute gradient, instead of 0.
-Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths,
-              const std::function<SceneGradients()>& make);
+// The gradients of a scene that are wanted. lengths: whether the third value of a row of means2d becomes the length of
+// its absolute gradient, instead of 0.
+Gradients vjp(const SceneTensors& scene, const GradientSource& source, bool lengths, const Wanted& wanted);
 
 }  // namespace gs::ops

@@ -168,27 +168,16 @@ void run(const SceneTensors& scene, const GradientSource& source, const Tensor& 
   if (later.lengths) gs::observe(gs::torch_executor(), later);
 }
 
-// planes: the gradients of colour, transmittance and inverse depth, or nothing for rows.
-// With `sums`, the results of rasterize_vjp for another view or tensors like these, which share no memory: adds a
-// view's gradients to them. Those of Gaussians that were not seen stay. With `absolute`, the third column of means2d is
-// this view's alone.
-// Without: rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (with `sparse` on the Gaussians of a radius
+// Does rasterize_vjp, penalise_ unless both penalties are 0, then adam_ (with `sparse` on the Gaussians of a radius
 // above 0) of the attributes that are named, and observe_ if statistics are given: the same bits, without gradients in
-// memory. Advances the counters as adam_ does. now: what `step_now_` wrote, which stands in for steps, rates and
-// iteration, and has advanced the counters. absolute: the statistics get the lengths of absolute gradients. guard: loss
-// and stopped.
+// memory. Advances the counters as adam_ does. planes: the gradients of colour, transmittance and inverse depth, or
+// nothing for rows. now: what `step_now_` wrote, which stands in for steps, rates and iteration, and has advanced the
+// counters. absolute: the statistics get the lengths of absolute gradients. guard: loss and stopped.
 void apply_gradients_op(List<Tensor> gaussians, List<Tensor> camera, List<double> lens, Sizes options,
-                        List<Tensor> source, List<MaybeTensor> planes, List<Tensor> sums, STEP_PARAMETERS) {
+                        List<Tensor> source, List<MaybeTensor> planes, STEP_PARAMETERS) {
   const SceneTensors scene = scene_of(gaussians, camera, lens, options);
   const MaybeTensor grad_color = entry(planes, 0), grad_transmittance = entry(planes, 1);
   const MaybeTensor grad_inverse_depth = entry(planes, 2);
-  if (!sums.empty()) {
-    const SceneGradients added(scene, sums);
-    const bool lengths = absolute && sums[kMeans2d].size(0) > 0;
-    GS_CHECK_VALUE(!lengths || !scene.blocks().defined(), "lengths of listed blocks' rows have no place in a sum");
-    vjp(scene, GradientSource(scene, SOURCE_ARGUMENTS, absolute, lengths), lengths, [&] { return added; });
-    return;
-  }
   const Step step{STEP_ARGUMENTS};
   step.check(scene);
   const Tensor pixels = packed(*radii), lengths = absolute_like(scene, absolute && step.observes());
@@ -259,8 +248,7 @@ void step_now_op(Tensor& now, Sizes attributes, List<Tensor> steps, List<double>
 GS_OPERATORS(diff_gaussian_rasterization, m) {
   m.define(
       "apply_gradients_(Tensor(a!)[] gaussians, "
-      "Tensor[] camera, " CAMERA_SCHEMA ", Tensor[] source, Tensor?[] planes, Tensor(b!)[] sums, " STEP_SCHEMA
-      ") -> ()",
+      "Tensor[] camera, " CAMERA_SCHEMA ", Tensor[] source, Tensor?[] planes, " STEP_SCHEMA ") -> ()",
       TORCH_BOX(&apply_gradients_op));
   m.define("wake_(Tensor(a!)[] gaussians, Tensor[] camera, " CAMERA_SCHEMA
            ", Tensor(b!)[] sleep, bool rests, Tensor(c!)[] averages, Tensor[] steps, Tensor[] guard, int[] attributes, "

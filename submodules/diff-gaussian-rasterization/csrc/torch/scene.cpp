@@ -156,25 +156,11 @@ Wanted checked_wanted(const std::vector<bool>& wanted) {
   return out;
 }
 
-SceneGradients::SceneGradients(const SceneTensors& in, const Wanted& wanted) : wanted_(wanted), adds_(false) {
+SceneGradients::SceneGradients(const SceneTensors& in, const Wanted& wanted) : wanted_(wanted) {
   for (int input = 0; input < kInputs; ++input) {
     const bool flat = input == kOpacities && wanted[input] && in.flat_opacities();
     tensors_[input] = empty(
         flat ? Shape{in.count()} : sizes_of(kRows[input], wanted[input] ? in.count() : 0, in.rest_bands()), in.means());
-  }
-}
-
-SceneGradients::SceneGradients(const SceneTensors& in, List<Tensor> sums) : adds_(true) {
-  GS_CHECK_VALUE(sums.size() == kInputs, "sums must have ", int(kInputs), " tensors, got ", sums.size());
-  for (int input = 0; input < kInputs; ++input) {
-    const Tensor& t = sums[input];
-    const std::string name = std::string("the sum of ") + kRows[input].name;
-    check_given(t, name.c_str());
-    wanted_[input] = t.dim() > 0 && t.size(0) > 0;  // rows may be empty, those of sh_rest without bands
-    check_tensor(t, name.c_str(), in.dtype(), in.device(),
-                 sizes_of(kRows[input], wanted_[input] ? in.count() : 0, in.rest_bands()));
-    GS_CHECK_VALUE(t.is_contiguous(), name, " must be contiguous");
-    tensors_[input] = t;
   }
 }
 

@@ -152,24 +152,22 @@ class SceneTensors {
   gs::Image image_;
 };
 
-// Owns the gradients of the inputs; those not wanted have no rows. They are new, or `sums` that gradients are added to.
+// Owns the gradients of the inputs; those not wanted have no rows.
 class SceneGradients {
  public:
   SceneGradients(const SceneTensors& in, const Wanted& wanted);
-  SceneGradients(const SceneTensors& in, List<Tensor> sums);
 
   template <class T>
   gs::SceneGradient<T> pointers() const {
     const auto of = [this](Input input) { return wanted_[input] ? write<T>(tensors_[input]) : nullptr; };
     return {of(kMeans), of(kMeans2d), of(kOpacities), of(kScales), of(kRotations),
-            of(kCov3d), of(kColors),  of(kShDc),      of(kShRest), adds_};
+            of(kCov3d), of(kColors),  of(kShDc),      of(kShRest)};
   }
   Gradients all() const { return std::tuple_cat(tensors_); }
 
  private:
   Wanted wanted_;
   InputTensors tensors_;
-  bool adds_;
 };
 
 }  // namespace gs::ops

@@ -12,7 +12,7 @@ Gradients rasterize_vjp_op(SCENE_PARAMETERS, const std::vector<bool>& wanted, SO
   const Wanted wants = checked_wanted(wanted);
   const bool lengths = absolute && wants[kMeans2d];
   const GradientSource from(scene, SOURCE_ARGUMENTS, absolute, lengths);
-  return vjp(scene, from, lengths, [&] { return SceneGradients(scene, wants); });
+  return vjp(scene, from, lengths, wants);
 }
 
 // The rows that rasterize_vjp sums, those of a splat side by side, in the order of its tiles, and their number for each

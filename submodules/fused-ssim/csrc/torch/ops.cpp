@@ -77,59 +77,54 @@ struct Means {
   double l1, ssim;
 };
 
+// What a forward gives of the means: L1 and SSIM, or with `lambda` the loss and L1.
 template <class T>
-Tensors2 photometric_loss(const Means& means, double lambda, const Tensor& like) {
-  const T loss = T(1 - lambda) * T(means.l1) + T(lambda) * (1 - T(means.ssim));
-  return {scalar(loss, like), scalar(T(means.l1), like)};
+Tensors2 scalars_of(const Means& means, const double* lambda, const Tensor& like) {
+  const T l1 = T(means.l1), ssim = T(means.ssim);
+  if (!lambda) return {scalar(l1, like), scalar(ssim, like)};
+  return {scalar(T(1 - *lambda) * l1 + T(*lambda) * (1 - ssim), like), scalar(l1, like)};
 }
 
-template <class T>
-Means means_of(const Tensor& img1, const Tensor& img2, bool clamp, bool valid, const Tensor& kept) {
-  Means means{};
-  const gs::L1Ssim<T> args{image_pair<T>(img1, img2, clamp), valid, &means.l1, &means.ssim,
-                           kept.numel() ? write<T>(kept) : nullptr};
-  GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
-  return means;
+#ifdef GS_CUDA
+// The same from kernels, which `run` launches with these arguments.
+template <class Run>
+Tensors2 scalars_of(gs::L1SsimCuda args, const double* lambda, const Tensor& like, const Run& run) {
+  const Tensor first = empty({}, like), second = empty({}, like);
+  args.l1 = write<float>(lambda ? second : first);
+  (lambda ? args.loss : args.ssim) = write<float>(lambda ? first : second);
+  if (lambda) args.l1_weight = float(1 - *lambda), args.dssim_weight = float(*lambda);
+  gs::TorchQueue queue(like.device());
+  run(args, queue.queue());
+  return {first, second};
 }
+#endif
 
-Tensors3 l1_ssim(const Tensor& img1_, const Tensor& img2_, bool valid, bool train) {
+Tensors3 forward(const Tensor& img1_, const Tensor& img2_, bool valid, bool train, bool clamp, const double* lambda) {
   check_images(img1_, img2_, valid);
   const Tensor img1 = packed(img1_), img2 = packed(img2_), kept = empty_kept(img1, train);
 #ifdef GS_CUDA
   if (img1.is_cuda()) {
-    gs::TorchQueue queue(img1.device());
-    Tensor l1 = empty({}, img1), ssim = empty({}, img1);
-    gs::l1_ssim_cuda({image_pair<float>(img1, img2, false), valid, write<float>(l1), write<float>(ssim),
-                      train ? write<float>(kept) : nullptr},
-                     queue.queue());
-    return {l1, ssim, kept};
+    const gs::L1SsimCuda args{image_pair<float>(img1, img2, clamp), valid, nullptr, nullptr,
+                              train ? write<float>(kept) : nullptr};
+    return std::tuple_cat(scalars_of(args, lambda, img1, gs::l1_ssim_cuda), std::tuple(kept));
   }
 #endif
   return with_scalar(img1, [&](auto zero) {
     using T = decltype(zero);
-    const Means means = means_of<T>(img1, img2, false, valid, kept);
-    return Tensors3(scalar(T(means.l1), img1), scalar(T(means.ssim), img1), kept);
+    Means means{};
+    const gs::L1Ssim<T> args{image_pair<T>(img1, img2, clamp), valid, &means.l1, &means.ssim,
+                             kept.numel() ? write<T>(kept) : nullptr};
+    GS_DISPATCH(l1_ssim_cpu, args, gs::torch_executor());
+    return std::tuple_cat(scalars_of<T>(means, lambda, img1), std::tuple(kept));
   });
 }
 
-Tensors3 photometric(const Tensor& img1_, const Tensor& img2_, double lambda, bool train, bool clamp) {
-  check_images(img1_, img2_, false);
-  const Tensor img1 = packed(img1_), img2 = packed(img2_), kept = empty_kept(img1, train);
-#ifdef GS_CUDA
-  if (img1.is_cuda()) {
-    gs::TorchQueue queue(img1.device());
-    Tensor loss = empty({}, img1), l1 = empty({}, img1);
-    gs::l1_ssim_cuda({image_pair<float>(img1, img2, clamp), false, write<float>(l1), nullptr,
-                      train ? write<float>(kept) : nullptr, write<float>(loss), float(1 - lambda), float(lambda)},
-                     queue.queue());
-    return {loss, l1, kept};
-  }
-#endif
-  return with_scalar(img1, [&](auto zero) {
-    using T = decltype(zero);
-    return std::tuple_cat(photometric_loss<T>(means_of<T>(img1, img2, clamp, false, kept), lambda, img1),
-                          std::tuple(kept));
-  });
+Tensors3 l1_ssim(const Tensor& img1, const Tensor& img2, bool valid, bool train) {
+  return forward(img1, img2, valid, train, false, nullptr);
+}
+
+Tensors3 photometric(const Tensor& img1, const Tensor& img2, double lambda, bool train, bool clamp) {
+  return forward(img1, img2, false, train, clamp, &lambda);
 }
 
 // The shape of the sums of all bands of an image.
@@ -175,19 +170,9 @@ Tensors2 photometric_of_sums(const Tensor& img1, const Tensor& sums, double lamb
            "sums must be those of all bands added, ", wanted, " float64, got ", sums.sizes(), " ", sums.scalar_type());
 #ifdef GS_CUDA
   if (img1.is_cuda()) {
-    gs::TorchQueue queue(img1.device());
-    Tensor loss = empty({}, img1), l1 = empty({}, img1);
-    gs::L1SsimCuda args{image_pair<float>(img1, img1, false),
-                        false,
-                        write<float>(l1),
-                        nullptr,
-                        nullptr,
-                        write<float>(loss),
-                        float(1 - lambda),
-                        float(lambda)};
+    gs::L1SsimCuda args{image_pair<float>(img1, img1, false), false, nullptr, nullptr, nullptr};
     args.sums = const_cast<double*>(read<double>(sums));
-    gs::l1_ssim_means_cuda(args, queue.queue());
-    return {loss, l1};
+    return scalars_of(args, &lambda, img1, gs::l1_ssim_means_cuda);
   }
 #endif
   return with_scalar(img1, [&](auto zero) {
@@ -195,7 +180,7 @@ Tensors2 photometric_of_sums(const Tensor& img1, const Tensor& sums, double lamb
     Means means{};
     const gs::L1SsimMeans<T> args{image_pair<T>(img1, img1, false), read<double>(sums), &means.l1, &means.ssim};
     GS_DISPATCH(l1_ssim_means_cpu, args);
-    return photometric_loss<T>(means, lambda, img1);
+    return scalars_of<T>(means, &lambda, img1);
   });
 }
 

@@ -42,22 +42,10 @@ __device__ void write_values(const float* values, int count, float* rows, int64_
     for (int k = 0; k < count; ++k) rows[count * i + k] = values[k];
 }
 
-__device__ void add_values(const float* rows, int count, int64_t i, float* values) {
-  if (rows)
-    for (int k = 0; k < count; ++k) values[k] = rows[count * i + k] + values[k];
-}
-
 __device__ void write_gradient(const RowGradient& g, int64_t i, const SceneGradient<float>& out) {
   write_values(g.means, 3, out.means, i), write_values(g.means2d, 3, out.means2d, i);
   write_values(&g.opacity, 1, out.opacities, i), write_values(g.scales, 3, out.scales, i);
   write_values(g.rotation, 4, out.rotations, i), write_values(g.sh_dc, 3, out.sh_dc, i);
-}
-
-// Adds row i of `sums`. All of it is read before any is written, as loads do not pass stores.
-__device__ void add_gradient(const SceneGradient<float>& sums, int64_t i, RowGradient& g) {
-  add_values(sums.means, 3, i, g.means), add_values(sums.means2d, 3, i, g.means2d);
-  add_values(sums.opacities, 1, i, &g.opacity), add_values(sums.scales, 3, i, g.scales);
-  add_values(sums.rotations, 4, i, g.rotation), add_values(sums.sh_dc, 3, i, g.sh_dc);
 }
 
 __device__ void write_gradient(const RowGradient& g, const WarpGradients& to) {
@@ -67,28 +55,9 @@ __device__ void write_gradient(const RowGradient& g, const WarpGradients& to) {
   to.opacities()[lane] = g.opacity;
 }
 
-// What rows of cov3d and colors were, while project_vjp_row writes theirs: nine values in shared memory.
-struct RowBefore {
-  static constexpr int kFloats = 9;
-  float* values;
-
-  __device__ void keep(const SceneGradient<float>& row) const {
-    for (int k = 0; row.cov3d && k < 6; ++k) values[k] = row.cov3d[k];
-    for (int k = 0; row.colors && k < 3; ++k) values[6 + k] = row.colors[k];
-  }
-  __device__ void add_to(const SceneGradient<float>& row) const {
-    for (int k = 0; row.cov3d && k < 6; ++k) row.cov3d[k] = values[k] + row.cov3d[k];
-    for (int k = 0; row.colors && k < 3; ++k) row.colors[k] = values[6 + k] + row.colors[k];
-  }
-};
-
-// In place of steps, which are not wanted: gradients are added to what is in memory.
-struct Addition : StepParameters {};
-
 // Computes gradients, and either writes them or takes the Gaussians' steps. It is one kernel for both, because a
 // compiler may fuse other products in another, and both must go the same way to the last bit. Step: StepParameters or
-// PenalisedStep, between which nothing differs but a call; or Addition, whose code would cost these registers, and
-// whose sums may therefore differ by rounding.
+// PenalisedStep, between which nothing differs but a call.
 template <class AnyCamera, class Source, class Step>
 __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kBlocks - 1 : kBlocks)
     project_vjp_kernel(const int32_t* halted, Scene<float> s, Source source, SceneGradient<float> out,
@@ -96,11 +65,9 @@ __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kB
   if (!begin_work(halted)) return;
   const int64_t block = awake_block(s, blockIdx.x);
   if (block < 0) return;
-  constexpr bool kAdds = std::is_same_v<Step, Addition>;
   constexpr int kRays = kOnRays<AnyCamera>;
   constexpr int kSums = SlotSums<kRays>::kStage,
                 kStage = kSums > WarpGradients::kFloats ? kSums : WarpGradients::kFloats;
-  static_assert(32 * RowBefore::kFloats <= kStage, "a warp has memory for the rows of its lanes");
   __shared__ AnyCamera camera;
   __shared__ __align__(16) float rest[kThreads * kRest];
   __shared__ __align__(16) float stage[kThreads / 32 * kStage];
@@ -123,13 +90,10 @@ __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kB
   RowGradient g = {};
   const SceneGradient<float> mine = g.pointers(out, i);
   if (seen) {
-    const RowBefore before{warp_stage + RowBefore::kFloats * (threadIdx.x & 31)};
-    if (kAdds) before.keep(mine);
     // Writes the row even if it is not wanted: a null pointer would be tested for every band.
     project_vjp_row(s, camera, SceneRow<float>{s, i}, m, row, row, mine, 0);
-    if (kAdds) before.add_to(mine);
   } else if (i < s.count) {
-    if (!kAdds) zero_row(mine.cov3d, 0, 6), zero_row(mine.colors, 0, 3);
+    zero_row(mine.cov3d, 0, 6), zero_row(mine.colors, 0, 3);
     for (int k = 0; k < 3 * s.rest_bands; ++k) row[k] = 0;
   }
   if (first >= s.count) return;
@@ -141,12 +105,8 @@ __global__ void __launch_bounds__(kThreads, kOnRays<AnyCamera> == kLensRays ? kB
     step_gaussians<kRest>(step, first, s.count, gradients, warp_rows);
     return;
   }
-  if (kAdds && seen) add_gradient(out, i, g);
-  if (kAdds ? seen : i < s.count) write_gradient(g, i, out);
-  if (!out.sh_rest) return;
-  if (kAdds)
-    add_rows(warp_rows, first, __ballot_sync(kWarp, seen), 3 * s.rest_bands, out.sh_rest);
-  else
+  if (i < s.count) write_gradient(g, i, out);
+  if (out.sh_rest)
     write_rows(warp_rows, first, int(s.count - first < 32 ? s.count - first : 32), 3 * s.rest_bands, out.sh_rest);
 }
 
@@ -163,15 +123,6 @@ void launch_project_vjp(const Queue& queue, const Scene<float>& s, const Source&
   else
     go(s.lens.chart == Chart::kPinhole ? project_vjp_kernel<Camera<float>, Source, Step>
                                        : project_vjp_kernel<LensCamera<float>, Source, Step>);
-}
-
-template <int kRays>
-void launch_gradients(const Queue& queue, const Scene<float>& s, const SlotSums<kRays>& source,
-                      const SceneGradient<float>& out) {
-  if (out.adds)
-    launch_project_vjp<kRays>(queue, s, source, out, Addition{});
-  else
-    launch_project_vjp<kRays>(queue, s, source, out, StepParameters{});
 }
 
 template <int kRays>
@@ -202,8 +153,7 @@ void by_kind_of_rows(const Scene<float>& s, const Run& run) {
 }
 template <class Run>
 void by_kind(const Scene<float>& s, const Run& run) {
-  if (s.rows() && s.rays() == kLensRays) return run(std::integral_constant<int, kLensRays>());
-  by_kind_of_rows(s, run);
+  if (s.rows()) by_rays(s.rays(), run);
 }
 
 }  // namespace
@@ -220,7 +170,7 @@ void rasterize_vjp(const Queue& queue, const Scene<float>& s, const BlendInput<f
                    const BlendGradient<float>& g, const GradientMemory& memory) {
   by_kind(s, [&](auto rays) {
     const SlotSums<rays> source{fill_rows<rays>(queue, in, g), g.slots};
-    launch_gradients<rays>(queue, s, source, memory.take(memory.context));
+    launch_project_vjp<rays>(queue, s, source, memory.take(memory.context), StepParameters{});
   });
 }
 
@@ -234,7 +184,7 @@ void rows_vjp(const Queue& queue, const Scene<float>& s, const SplatRows<float>&
               const GradientMemory& memory) {
   by_kind_of_rows(s, [&](auto rays) {
     const SlotSums<rays> source = sums_of<rays>(queue, in, to);
-    launch_gradients<rays>(queue, s, source, memory.take(memory.context));
+    launch_project_vjp<rays>(queue, s, source, memory.take(memory.context), StepParameters{});
   });
 }
 

@@ -171,10 +171,7 @@ template SlotSums<kPinholeRays> sums_of<kPinholeRays>(const Queue&, const SplatR
 
 template <>
 void blend_vjp<float>(const Queue& queue, const BlendInput<float>& in, const BlendGradient<float>& g) {
-  const auto sum = in.rays == kLensRays ? sum_moments<kLensRays>
-                   : in.rays            ? sum_moments<kPinholeRays>
-                                        : sum_moments<kNoRays>;
-  if (g.count) sum(queue, in, g);
+  if (g.count) by_rays(in.rays, [&](auto rays) { sum_moments<rays>(queue, in, g); });
 }
 
 }  // namespace cuda

@@ -51,9 +51,7 @@ void make_lists(const Queue& queue, int64_t count, const Projected<float>& in, c
   launch(queue, "count", count_kernel, shares, kListThreads, count, splats, in, image, counts, of_shares);
   // Images of many tiles have many splats without a mask.
   const unsigned large_blocks = std::clamp<unsigned>(unsigned(tiles) / 16, 256, 2048);
-  const auto count_large = in.rays == kLensRays ? count_large_kernel<kLensRays>
-                           : in.rays            ? count_large_kernel<kPinholeRays>
-                                                : count_large_kernel<kNoRays>;
+  const auto count_large = by_rays(in.rays, [](auto rays) { return count_large_kernel<rays>; });
   launch(queue, "count_large", count_large, large_blocks, kListThreads, in, image, counts);
   launch(queue, "lay_out", lay_out_kernel, 1, kLayThreads, tiles, counts, begins, shares, of_shares, totals,
          memory.ahead ? *memory.ahead : Ahead{});
@@ -69,9 +67,7 @@ void make_lists(const Queue& queue, int64_t count, const Projected<float>& in, c
   const Binned out = memory.take(memory.context, room.instances, memory.slots ? room.slots : 0);
   const unsigned further = unsigned(room.instances / kPiece), pieces = further + unsigned(tiles);
   const ListWork work{begins, queue.array<uint64_t>(room.instances), counts.further, queue.array<int2>(further)};
-  const auto fill = in.rays == kLensRays ? fill_kernel<kLensRays>
-                    : in.rays            ? fill_kernel<kPinholeRays>
-                                         : fill_kernel<kNoRays>;
+  const auto fill = by_rays(in.rays, [](auto rays) { return fill_kernel<rays>; });
   launch(queue, "fill", fill, shares + large_blocks, kListThreads, count, splats, shares, in, image, counts, of_shares,
          memory.slots, work);
   queue.release(queue.context, counts.large), queue.release(queue.context, counts.places);

@@ -27,9 +27,7 @@ __global__ void __launch_bounds__(kRecordThreads)
 // in: without records, of an image with has_records.
 inline TileRecord* make_records(const Queue& queue, int64_t n, const Projected<float>& in, Image image) {
   TileRecord* records = queue.array<TileRecord>(n);
-  const auto kernel = in.rays == kLensRays ? make_records_kernel<kLensRays>
-                      : in.rays            ? make_records_kernel<kPinholeRays>
-                                           : make_records_kernel<kNoRays>;
+  const auto kernel = by_rays(in.rays, [](auto rays) { return make_records_kernel<rays>; });
   launch(queue, "make_records", kernel, blocks_for(n, kRecordThreads), kRecordThreads, n, in, image, records);
   return records;
 }

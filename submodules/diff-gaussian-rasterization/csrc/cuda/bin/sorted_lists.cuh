@@ -200,9 +200,7 @@ void sort_by_tile(const Queue& queue, int64_t n, const Projected<float>& in, con
   const Projected<float> lined = line_up(queue, n, in, order);
   const int32_t* offsets = find_offsets(queue, n, lined);
   Key* emitted = queue.array<Key>(instances);
-  const auto emit = in.rays == kLensRays ? emit_kernel<Key, kLensRays>
-                    : in.rays            ? emit_kernel<Key, kPinholeRays>
-                                         : emit_kernel<Key, kNoRays>;
+  const auto emit = by_rays(in.rays, [](auto rays) { return emit_kernel<Key, rays>; });
   launch(queue, "emit", emit, blocks_for(n, kEmitThreads), kEmitThreads, n, int32_t(instances), order, offsets, in,
          lined, image, emitted, out.instances);
   queue.release(queue.context, order), queue.release(queue.context, offsets);

@@ -332,9 +332,7 @@ void blend_chunks(const Queue& queue, const BlendInput<float>& in, const Blended
   const bool depth = out.inverse_depth;
   float* values = out.layers;
   if (!values) values = queue.array<float>(layer_values(in.image, in.instance_count, depth));
-  const auto kernel = in.rays == kLensRays ? blend_chunks_kernel_for<kLensRays>(depth, out.last)
-                      : in.rays            ? blend_chunks_kernel_for<kPinholeRays>(depth, out.last)
-                                           : blend_chunks_kernel_for<kNoRays>(depth, out.last);
+  const auto kernel = by_rays(in.rays, [&](auto rays) { return blend_chunks_kernel_for<rays>(depth, out.last); });
   const unsigned blocks = std::min(schedule.blocks, kMostBlocks);
   launch(queue, "blend_chunks", kernel, blocks, L::kThreads, in, progress, layers_at(values, in.instance_count), out);
 }

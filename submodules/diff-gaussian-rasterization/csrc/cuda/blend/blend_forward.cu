@@ -149,9 +149,7 @@ template <>
 void blend<float>(const Queue& queue, const BlendInput<float>& in, const Blended<float>& out) {
   if (in.channels.count) return blend_channels(queue, in, out);
   if (makes_layers(in.image)) return blend_chunks(queue, in, out);
-  const auto kernel = in.rays == kLensRays ? blend_kernel_for<kLensRays>(out)
-                      : in.rays            ? blend_kernel_for<kPinholeRays>(out)
-                                           : blend_kernel_for<kNoRays>(out);
+  const auto kernel = by_rays(in.rays, [&](auto rays) { return blend_kernel_for<rays>(out); });
   launch(queue, "blend", kernel, unsigned(tiles_of(in.image)), L::kThreads, in, out);
 }
 

@@ -44,9 +44,7 @@ __global__ void __launch_bounds__(kTile* kTile)
 
 template <>
 void mark_decisive<float>(const Queue& queue, const BlendInput<float>& in, const int32_t* last, bool* decisive) {
-  const auto kernel = in.rays == kLensRays ? decisive_kernel<kLensRays>
-                      : in.rays            ? decisive_kernel<kPinholeRays>
-                                           : decisive_kernel<kNoRays>;
+  const auto kernel = by_rays(in.rays, [](auto rays) { return decisive_kernel<rays>; });
   kernel<<<unsigned(tiles_of(in.image)), kTile * kTile, 0, stream_of(queue)>>>(in, last, decisive);
   check_launch("decisive");
 }

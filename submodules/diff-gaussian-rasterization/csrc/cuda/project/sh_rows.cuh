@@ -63,35 +63,5 @@ __device__ inline void write_rows(const float* rows, int64_t first, int count, i
   }
 }
 
-// Adds those of the warp's rows that have a bit in `wanted` to rows of such a tensor. A lane reads several values
-// before it writes any, as loads do not pass stores.
-__device__ inline void add_rows(const float* rows, int64_t first, unsigned wanted, int values, float* global) {
-  __syncwarp();
-  constexpr int kAtOnce = 8;                      // rows
-  constexpr int kLaneValues = (kRest + 31) / 32;  // of a row
-  const int lane = threadIdx.x & 31;
-  float* to = global + first * values;
-  while (wanted) {
-    const float* from[kAtOnce];
-    float* place[kAtOnce];
-    float sum[kAtOnce][kLaneValues];
-#pragma unroll
-    for (int j = 0; j < kAtOnce; ++j) {
-      const int row = __ffs(wanted) - 1;  // -1: none is left
-      wanted &= wanted - 1;
-      from[j] = row < 0 ? nullptr : rows + row * kRest;
-      place[j] = row < 0 ? nullptr : to + row * values;
-#pragma unroll
-      for (int k = 0; k < kLaneValues; ++k)
-        if (from[j] && lane + 32 * k < values) sum[j][k] = place[j][lane + 32 * k];
-    }
-#pragma unroll
-    for (int j = 0; j < kAtOnce; ++j)
-#pragma unroll
-      for (int k = 0; k < kLaneValues; ++k)
-        if (from[j] && lane + 32 * k < values) place[j][lane + 32 * k] = sum[j][k] + from[j][lane + 32 * k];
-  }
-}
-
 }  // namespace cuda
 }  // namespace gs

@@ -7,16 +7,12 @@ namespace gs {
 
 template <class T>
 void describe(const Executor& executor, const DescribeInput<T>& in, const Descriptions<T>& out) {
-  executor.run(in.count, 4096, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) baseline::describe_splat(in, out, i);
-  });
+  for_each_row(executor, in.count, 4096, [&](int64_t i) { baseline::describe_splat(in, out, i); });
 }
 
 template <class T>
 void describe_vjp(const Executor& executor, const DescribedInput<T>& in, const DescribedGradient<T>& out) {
-  executor.run(in.count, 4096, [&](int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) baseline::describe_vjp_splat(in, out, i);
-  });
+  for_each_row(executor, in.count, 4096, [&](int64_t i) { baseline::describe_vjp_splat(in, out, i); });
 }
 
 template <class T>
