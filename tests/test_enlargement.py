@@ -123,7 +123,7 @@ def test_noise_and_penalty_of_mcmc(scenes, tmp_path):
         gaussians.training_setup(opt)
         gaussians._opacity.data.fill_(-5)
         before, control = gaussians._xyz.detach().clone(), begun("mcmc", gaussians, opt, Schedule(opt.iterations))
-        control.after_step(SimpleNamespace(iteration=1, changes=False))
+        control.after_step(SimpleNamespace(iteration=1, changes=False, density=control.actions(1)))
         moves.append((gaussians._xyz.detach() - before) / cloud.extent)
         penalties.append(control.penalty.scale * gaussians.get_scaling.mean().item())
         sizes.append(gaussians.enlargement * cloud.extent)

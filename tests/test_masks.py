@@ -360,7 +360,7 @@ def test_masks_that_leave_nothing_do_not_train_silently(masked_scene, tmp_path, 
     paths = [path for path in sorted(masked_scene.rglob("masks/**/*")) if path.is_file()]
     for path in paths:
         _save(path, np.zeros((HEIGHT, WIDTH), np.uint8))
-    with pytest.raises(UserError, match="14 of the 14 photos .* show nothing, as every pixel is left out by masks; "):
+    with pytest.raises(UserError, match="16 of the 16 photos .* show nothing, as every pixel is left out by masks; "):
         _train(masked_scene, tmp_path / "out", "--masks", "masks")
     assert not (tmp_path / "out" / "point_cloud").exists()
     assert _train(masked_scene, tmp_path / "out", "--masks", "masks", "--invert_masks")

@@ -24,7 +24,8 @@ from trainings import (
     whole_result,
 )
 
-from splatting import loop, run
+from splatting import loop
+from splatting import make_run as making
 from splatting.faster import captured, faster_steps, speculative
 from splatting.faster.captured import CapturedStep
 from splatting.faster.faster import FasterSteps
@@ -111,7 +112,7 @@ def test_what_may_want_gradients_takes_the_plain_step(scene, tmp_path, monkeypat
     ):
         train_on(scene, tmp_path / name, *short, *pipe)
     torch.autograd.set_detect_anomaly(False)
-    monkeypatch.setattr(run, "Objective", WithFurtherTerm)
+    monkeypatch.setattr(making, "Objective", WithFurtherTerm)
     train_on(scene, tmp_path / "e", *short)
     fast = CapturedStep if torch.cuda.is_available() else FusedStep
     assert [type(one) for one in taken] == [fast, *[FasterSteps] * 4]
@@ -151,14 +152,14 @@ TERMS = {
 @pytest.mark.parametrize(("ways", "late", "fused", "term"), TERMS.values(), ids=TERMS.keys())
 def test_a_term_that_was_added_is_not_lost(scene, tmp_path, without, monkeypatch, take_as, ways, late, fused, term):  # noqa: F811
     """Gradients past the image make the steps from there on plain; what asks for more than an image is not captured."""
-    call, make, models, calls = Objective.__call__, run.GaussianModel, [], []
+    call, make, models, calls = Objective.__call__, making.GaussianModel, [], []
 
     def with_term(self, package, at):
         losses = call(self, package, at)
         calls.append(1)
         return losses if len(calls) <= late else losses._replace(total=term(losses, package, at, models[-1]._scaling))
 
-    monkeypatch.setattr(run, "GaussianModel", lambda *x: (models.append(make(*x)), calls.clear(), models[-1])[2])
+    monkeypatch.setattr(making, "GaussianModel", lambda *x: (models.append(make(*x)), calls.clear(), models[-1])[2])
     monkeypatch.setattr(Objective, "__call__", with_term)
     take_as("plain")
     plain = trained_as("default", scene, tmp_path / "plain")

@@ -211,7 +211,7 @@ def _all(scene: Path, folder: Path, kinds: list[tuple[str, tuple[str, ...]]]) ->
 @pytest.mark.parametrize("size", [2, 3])
 def test_ranks(scene, tmp_path, once, plain, size):
     """With all that a kind may have of its own: terms, optimisers, strategies, cameras, and images of one tile."""
-    names = "sparse", "appearance", "tiny", "together", "mcmc", "budget", "poses", "rays"
+    names = "sparse", "appearance", "tiny", "together", "mcmc", "budget", "poses"
     kinds = [(name, ()) for name in (*names, "asleep, together", "asleep, budget")]
     kinds.append(("exposure", ("--plain_step",)))
     start = plain_training(once, "asleep, default") / "chkpnt33.pth"
