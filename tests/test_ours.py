@@ -23,10 +23,11 @@ MAY = {
     "the one place that looks for programs": "groundwork.host.programs.find_program",
     "runs what find_program found, such as npm and what that installs by a record of the repository": """
         groundwork.host.machine._output applications.doctor.environment._find_nvidia_gpu
-        applications.convert.colmap._output applications.export.sog.find_fault applications.export.vendor._run_command
-        applications.convert.programs._run gaussian_renderer.camera_paths.video.write_video""",
+        applications.convert.colmap._read_output applications.export.sog.find_fault
+        applications.export.vendor._run_command applications.convert.programs._run_command
+        gaussian_renderer.camera_paths.video.write_video""",
     "runs imageio-ffmpeg's ffmpeg, without relative entries of PATH": """applications.convert.video._warn_if_cut
-        applications.convert.video._sdr_filters applications.convert.video.find_streams""",
+        applications.convert.video._list_sdr_filters applications.convert.video.find_streams""",
     "runs sys.executable with files of this repository": """groundwork.host.machine.facts_from_process
         applications.doctor.advice._train applications.evaluation.child.run_child
         splatting.records.curve_recorder.begin""",
@@ -50,7 +51,7 @@ MAY = {
     "a reserved name in `distorted`, or in a scene that convert.py has made; refuse_foreign_results knows": """
         applications.convert.adding.forget_base applications.convert.adding.keep_base
         applications.convert.mapping.map_photos applications.convert.colmap.copy_database
-        applications.convert.stages._remove""",
+        applications.convert.stages._remove_paths""",
 }
 CALLS = {"rmtree", "unlink", "rmdir", "which", "Popen", "check_call", "check_output", "system", "removedirs"}
 OF_MODULES = {("subprocess", "run"), ("subprocess", "call"), ("os", "remove"), ("os", "popen"), ("torch", "load")}
