@@ -39,7 +39,7 @@ MAY = {
     "a picture that is_ours, below `input`": "applications.convert.video.remove_frames",
     "what this process itself has just made, or files with names of atomic_write, whose process has ended": """
         applications.export.side_files.write_with_folder applications.export.streamed.write_lod_meta
-        applications.demo.make_scene.make_scene applications.nerfbaselines.method._begin
+        applications.demo.make_scene.make_scene applications.nerfbaselines.method._begin_training
         groundwork.files.writing.atomic_write groundwork.files.folders.locked
         groundwork.files.folders.remove_temporary_files""",
     "numbered renders, or a reserved name in a model folder, which a training or a rendering makes anew": """
