@@ -34,7 +34,8 @@ MAY = {
     "runs compilers, where BuildBackends left relative entries of PATH out, and empties setuptools' build folder": """
         submodules.common.build_extension.run submodules.common.build_extension.find_compiler
         submodules.common.build_extension.find_nvcc submodules.common.build_extension.toolkit_root""",
-    "the scene's orientation, where there was none before the page wrote it": "applications.viewer.measure_tab._put",
+    "the scene's orientation, where there was none before the page wrote it": """
+        applications.viewer.measure_tab._write_records""",
     "a folder that is_ours, and that no other JSON file names": "applications.export.side_files._remove_folder",
     "a picture that is_ours, below `input`": "applications.convert.video.remove_frames",
     "what this process itself has just made, or files with names of atomic_write, whose process has ended": """
