@@ -219,8 +219,8 @@ def test_a_small_model_beside_a_folded_one_is_not_trusted():
     folded = {"photos": 24, "pairs": 99, "agreeing": 14, "contradicting": 0.04, "alike": ["1", "2"]}
     small = folded | {"photos": 14, "alike": []}
     large = folded | {"photos": 22, "agreeing": 22, "alike": []}
-    assert max([folded, small], key=partial(mapping._rank_key, [folded, small])) is folded
-    assert max([folded, large], key=partial(mapping._rank_key, [folded, large])) is large
+    assert max([folded, small], key=partial(mapping._rank_model, [folded, small])) is folded
+    assert max([folded, large], key=partial(mapping._rank_model, [folded, large])) is large
 
 
 def test_when_a_model_is_called_wrong():

@@ -23,22 +23,24 @@ MAY = {
     "the one place that looks for programs": "groundwork.host.programs.find_program",
     "runs what find_program found, such as npm and what that installs by a record of the repository": """
         groundwork.host.machine._output applications.doctor.environment._find_nvidia_gpu
-        applications.convert.colmap._output applications.export.sog.find_fault applications.export.vendor._run_command
-        applications.convert.programs._run gaussian_renderer.camera_paths.video.write_video""",
+        applications.convert.colmap._read_output applications.export.sog.find_fault
+        applications.export.vendor._run_command applications.convert.programs._run_command
+        gaussian_renderer.camera_paths.video.write_video""",
     "runs imageio-ffmpeg's ffmpeg, without relative entries of PATH": """applications.convert.video._warn_if_cut
-        applications.convert.video._sdr_filters applications.convert.video.find_streams""",
+        applications.convert.video._list_sdr_filters applications.convert.video.find_streams""",
     "runs sys.executable with files of this repository": """groundwork.host.machine.facts_from_process
         applications.doctor.advice._train applications.evaluation.child.run_child
         splatting.records.curve_recorder.begin""",
     "runs compilers, where BuildBackends left relative entries of PATH out, and empties setuptools' build folder": """
         submodules.common.build_extension.run submodules.common.build_extension.find_compiler
         submodules.common.build_extension.find_nvcc submodules.common.build_extension.toolkit_root""",
-    "the scene's orientation, where there was none before the page wrote it": "applications.viewer.measure_tab._put",
+    "the scene's orientation, where there was none before the page wrote it": """
+        applications.viewer.measure_tab._write_records""",
     "a folder that is_ours, and that no other JSON file names": "applications.export.side_files._remove_folder",
     "a picture that is_ours, below `input`": "applications.convert.video.remove_frames",
     "what this process itself has just made, or files with names of atomic_write, whose process has ended": """
         applications.export.side_files.write_with_folder applications.export.streamed.write_lod_meta
-        applications.demo.make_scene.make_scene applications.nerfbaselines.method._begin
+        applications.demo.make_scene.make_scene applications.nerfbaselines.method._begin_training
         groundwork.files.writing.atomic_write groundwork.files.folders.locked
         groundwork.files.folders.remove_temporary_files""",
     "numbered renders, or a reserved name in a model folder, which a training or a rendering makes anew": """
@@ -50,7 +52,7 @@ MAY = {
     "a reserved name in `distorted`, or in a scene that convert.py has made; refuse_foreign_results knows": """
         applications.convert.adding.forget_base applications.convert.adding.keep_base
         applications.convert.mapping.map_photos applications.convert.colmap.copy_database
-        applications.convert.stages._remove""",
+        applications.convert.stages._remove_paths""",
 }
 CALLS = {"rmtree", "unlink", "rmdir", "which", "Popen", "check_call", "check_output", "system", "removedirs"}
 OF_MODULES = {("subprocess", "run"), ("subprocess", "call"), ("os", "remove"), ("os", "popen"), ("torch", "load")}

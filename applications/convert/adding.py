@@ -41,14 +41,14 @@ def keep_base(layout: Layout, finished: bool, names: Sequence[str]) -> None:
             else f"--add needs a scene that convert.py has finished, and {layout.scene} is none; leave --add out"
         )
     if gone := sorted(set(list_photos(layout.base_database)) - prepared):
-        lacking = some([_original_name(name) for name in gone])
+        lacking = some([_strip_suffix(name) for name in gone])
         raise UserError(
             f"--add keeps the photos of the scene, and {layout.input} lacks {lacking}; put them back, or leave --add "
             "out to begin anew"
         )
 
 
-def _original_name(name: str) -> str:
+def _strip_suffix(name: str) -> str:
     """Return a prepared photo's name without the suffix that `prepare_images` appended."""
     own = name.rpartition(".")[0]
     return own if own.lower().endswith(PHOTO_SUFFIXES) else name

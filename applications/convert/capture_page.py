@@ -47,7 +47,8 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
     seconds: returns those of the stages before.
     """
 
-    def work() -> None:
+    def rate_scene() -> None:
+        """Add the rating of the capture to convert_report.json, and write capture.html."""
         survey, root = read_json(layout.capture), layout.prepared if layout.prepared.is_dir() else layout.input
         looks = compare_brightness(measure_looks(root, image_names(root)), layout)
         report = read_json(layout.report)
@@ -55,7 +56,7 @@ def capture_stage(layout: Layout, names: Sequence[str], seconds: Callable[[], di
         write_json(layout.report, report)
         write_page(layout.page, report, survey, looks, sorted({*looks, *survey["photos"]}), root)
 
-    return Stage("capture", list(names), lambda: None, work, makes=[layout.page])
+    return Stage("capture", list(names), lambda: None, rate_scene, makes=[layout.page])
 
 
 def write_page(
@@ -67,16 +68,16 @@ def write_page(
     names: of all photos, in order.
     root: the folder of the photos.
     """
-    photos = _photos(report, survey["photos"], looks, names)
+    photos = _list_photos(report, survey["photos"], looks, names)
     pictured = [photo for photo in photos if photo["problems"] or len(photos) <= _MOST][:_MOST]
     files = [root / photo["name"] for photo in pictured]
-    thumbnails = in_threads(_thumbnail, files, desc="Making thumbnails")
+    thumbnails = in_threads(_make_thumbnail, files, desc="Making thumbnails")
     for photo, thumbnail in zip(pictured, thumbnails, strict=True):
         photo["thumbnail"] = thumbnail
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     environment = jinja2.Environment(loader=jinja2.FileSystemLoader(Path(__file__).parent), **options)
     text = environment.get_template("capture.html.jinja").render(
-        above=_from_above(survey), is_wrong=is_wrong, way_name=way_name, lines=_lines(report), photos=photos,
+        above=_draw_from_above(survey), is_wrong=is_wrong, way_name=way_name, lines=_list_lines(report), photos=photos,
         pictured=len(pictured), report=report, scene=path.absolute().parent.name, unusable=why_unusable(report),
     )  # fmt: skip
     with atomic_write(path) as temporary:
@@ -84,7 +85,7 @@ def write_page(
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
 
 
-def _lines(report: _Data) -> list[tuple[str, bool]]:
+def _list_lines(report: _Data) -> list[tuple[str, bool]]:
     """List the lines of the report but those on photos to take, each with True if it tells of a problem."""
     found = {"overlap": report["weakly_connected"], "blur": report["blurred"], "brightness": training_options(report)}
     said = describe_capture(report)[: -len(report["again"]) or None]  # photos to take again come last
@@ -95,7 +96,7 @@ def _lines(report: _Data) -> list[tuple[str, bool]]:
     ]
 
 
-def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequence[str]) -> list[dict[str, Any]]:
+def _list_photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequence[str]) -> list[dict[str, Any]]:
     """Return name, problems and facts (by title) of each photo, photos with problems first; `row` numbers them."""
     neighbours, against = find_neighbours(placed), set((report.get("tried") or [{}])[0].get("against", ()))
     sharpness = np.median([look.sharpness for look in looks.values() if np.isfinite(look.sharpness)] or [1])
@@ -124,7 +125,7 @@ def _photos(report: _Data, placed: _Data, looks: Mapping[str, Look], names: Sequ
     return [photo | {"row": row} for row, photo in enumerate(photos)]
 
 
-def _thumbnail(path: Path) -> str | None:
+def _make_thumbnail(path: Path) -> str | None:
     """A photo as a small embedded JPEG; None if it is missing or cannot be read."""
     try:
         with open_image(path) as image:
@@ -133,16 +134,17 @@ def _thumbnail(path: Path) -> str | None:
     except UNREADABLE:
         return None
     small.thumbnail((_THUMBNAIL, _THUMBNAIL))
-    return _embedded(small, "JPEG", quality=70, optimize=True)
+    return _embed_image(small, "JPEG", quality=70, optimize=True)
 
 
-def _embedded(image: Image.Image, kind: str, **options: Any) -> str:
+def _embed_image(image: Image.Image, kind: str, **options: Any) -> str:
+    """Return a picture as a data: URI. kind: Pillow's name of the format; options: of its `save`."""
     buffer = io.BytesIO()
     image.save(buffer, kind, **options)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(buffer.getvalue()).decode()}"
 
 
-def _from_above(survey: _Data) -> dict[str, Any]:
+def _draw_from_above(survey: _Data) -> dict[str, Any]:
     """The picture from above: its size, the points as a PNG, and of each camera by name x, y, degrees and length."""
     photos = survey["photos"]
     places, views, ups = (np.array([photo[key] for photo in photos.values()]) for key in ("place", "view", "up"))
@@ -160,4 +162,8 @@ def _from_above(survey: _Data) -> dict[str, Any]:
     canvas[spots[inside, 1], spots[inside, 0]] = colors[inside]
     cameras = np.c_[(flat - low) * scale + _MARGIN, np.degrees(np.arctan2(*along.T[::-1])), np.hypot(*along.T)]
     named = dict(zip(photos, cameras.tolist(), strict=True))
-    return {"size": size.tolist(), "points": _embedded(Image.fromarray(canvas), "PNG", optimize=True), "cameras": named}
+    return {
+        "size": size.tolist(),
+        "points": _embed_image(Image.fromarray(canvas), "PNG", optimize=True),
+        "cameras": named,
+    }

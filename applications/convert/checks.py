@@ -1,6 +1,9 @@
 """Checks of a capture and its conversion: photos left out, poses that contradict their matches, photos to take again.
 
-convert.py's report has their results, which train.py and doctor.py read.
+convert.py's report has their results, which train.py and doctor.py read. Several checks read the judgement of a model
+(`found`), the JSON of worker.py's step judging. It compares pairs: two photos whose matches passed a geometric check of
+the pair alone. A pair contradicts the model where its matches fit the model's poses much worse than they fit the pair's
+own best geometry (scene/agreement.py).
 """
 
 import math
@@ -103,7 +106,7 @@ def check_reconstruction(
     if others:
         sizes = f"{len(chosen.registered)} photos are used, the other parts have {', '.join(map(str, others))}"
         remedy = "take photos that lead from one part to the next"
-        remedy += _unless_per_photo(mode, ", or try --cameras per_photo if they came through several lenses")
+        remedy += _advise_per_photo(mode, ", or try --cameras per_photo if they came through several lenses")
         yield Finding(f"the photos form {len(others) + 1} unconnected parts ({sizes})", remedy)
     if (points := chosen.points + more_points) < FEWEST_POINTS:
         remedy = "use larger or more photos" + (f", or --max_num_features {2 * at_limit}" if at_limit else "")
@@ -113,11 +116,11 @@ def check_reconstruction(
         yield Finding(text, f"take more photos, {_OVERLAPPING}")
     if _has_large_error(chosen):
         remedy = "if objects moved, mask them (--mask_path); for a fisheye lens use --camera OPENCV_FISHEYE"
-        remedy += _unless_per_photo(mode, "; if the photos come from several lenses, try --cameras per_photo")
+        remedy += _advise_per_photo(mode, "; if the photos come from several lenses, try --cameras per_photo")
         yield Finding(f"the mean reprojection error is {chosen.error:.1f} pixels", remedy)
 
 
-def _unless_per_photo(mode: str, text: str) -> str:
+def _advise_per_photo(mode: str, text: str) -> str:
     """Return a text that advises --cameras per_photo; "" if that is the mode already."""
     return "" if mode == "per_photo" else text
 
@@ -145,7 +148,7 @@ def _check_judgement(
         yield Finding(text, "look at capture.html, or take more photos that overlap")
     if is_wrong(found):
         matches = f"{found['contradicting']:.0%} of the matches that they were made from"
-        remedy = _unless_per_photo(
+        remedy = _advise_per_photo(
             mode, "if photos are of several lenses, zoomed or cropped, use --cameras per_photo; else "
         )
         remedy += "remove photos of other things from input, and take more that overlap"
@@ -153,7 +156,7 @@ def _check_judgement(
     lonely = [name for name in found.get("against", ()) if partners.get(name, 0) <= LONELY]
     if against := sorted(set(found.get("against", ())) - set(lonely)):
         text = f"{len(against)} of {photos} photos left out ({some(against)}), since their matches contradict the"
-        remedy = _unless_per_photo(
+        remedy = _advise_per_photo(
             mode, "if they are of another lens, zoomed or cropped, use --cameras per_photo; else "
         )
         yield Finding(f"{text} others", f"{remedy}remove them from input, and take more there")
@@ -163,7 +166,15 @@ def _check_judgement(
 
 
 def is_wrong(found: Mapping[str, Any]) -> bool:
-    """Tell if a judged model is wrong, although it is the best one; a model without pairs cannot be judged."""
+    """Tell if a judged model is wrong, although it is the best one; a model without pairs cannot be judged.
+
+    found: the judgement of the model, of which these entries count:
+    pairs: number of pairs of photos;
+    contradicting: share of the matches that belong to pairs which contradict the model, [0, 1];
+    agreeing: number of photos in the largest group whose pairs agree with each other;
+    photos: number of photos in the model;
+    rotation, alike: see `is_only_turned` and `is_folded`, which make a model wrong as well.
+    """
     if not found.get("pairs"):
         return False
     is_split = found["contradicting"] > CONTRADICTING or found["agreeing"] < SOUND * found["photos"]
@@ -171,12 +182,19 @@ def is_wrong(found: Mapping[str, Any]) -> bool:
 
 
 def is_folded(found: Mapping[str, Any]) -> bool:
-    """Tell if a judged model lays parts which look alike upon each other."""
+    """Tell if a judged model is folded: it lays different places that look alike upon each other.
+
+    found: its entry `alike` has the photos to leave out so that no two stand in one place and show different things.
+    """
     return len(found.get("alike", ())) > ALIKE * found.get("photos", 0)
 
 
 def is_only_turned(found: Mapping[str, Any]) -> bool:
-    """Tell if the camera of a judged model stood in one place."""
+    """Tell if the camera of a judged model only turned in one place, so that no depth can be measured.
+
+    found: its entry `rotation` has the error of the matches under rotations alone, as a share of a photo's longer side
+    (None: not known); a small error means that the camera did not move.
+    """
     error = found.get("rotation")
     return error is not None and error < TURNED
 
@@ -279,6 +297,14 @@ def rate_capture(
 def _list_retakes(
     gaps: list[tuple[int, str, str]], left_out: list[str], weak: list[str], soft: list[str], spread: float | None
 ) -> list[str]:
+    """List sentences on what to photograph again, one for each kind of fault.
+
+    gaps: number of unplaced photos, and the names of the placed photos before and after them.
+    left_out: names of other photos without a pose.
+    weak: names of photos with few neighbours.
+    soft: names of blurred photos.
+    spread: standard deviation of the brightness, in stops; None: not known.
+    """
     lines = [
         f"Take photos between {before} and {after}: {count} there could not be placed" for count, before, after in gaps
     ]

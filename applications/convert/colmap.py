@@ -99,17 +99,21 @@ class Pycolmap(Backend):
         self.identity = f"pycolmap {version('pycolmap')}"
 
     def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
-        return self._command("features", groups=groups, masks=str(self.layout.masks) if masks else "")
+        return self._make_commands("features", groups=groups, masks=str(self.layout.masks) if masks else "")
 
     def matching(self) -> list[Command]:
-        return self._command("matching", all_of=ALL_PAIRS)
+        return self._make_commands("matching", all_of=ALL_PAIRS)
 
     def mapping(self, way: str, models: Path) -> list[Command]:
         step = way if way in (GIVEN, ADDING) else "mapping"
         places = {"models": str(models), "calibrated": str(self.layout.calibrated)}
-        return self._command(step, mapper=way, tolerance=TOLERANCE, **places)
+        return self._make_commands(step, mapper=way, tolerance=TOLERANCE, **places)
 
-    def _command(self, step: str, **job: Any) -> list[Command]:
+    def _make_commands(self, step: str, **job: Any) -> list[Command]:
+        """Return the command of a step of worker.py.
+
+        job: entries of the job file that replace or extend the settings and the paths of the layout.
+        """
         places = {
             "database": self.layout.database,
             "images": self.layout.prepared,
@@ -129,6 +133,10 @@ class Program(Backend):
     """
 
     def __init__(self, executable: str, layout: Layout, settings: Settings) -> None:
+        """Ask the program for its version and its options. UserError if it cannot do what the settings need.
+
+        executable: name or path of the program.
+        """
         super().__init__(layout, settings)
         self._executable = find_program(executable)
         if self._executable is None:
@@ -136,7 +144,7 @@ class Program(Backend):
                 f"there is no {executable} on PATH; pass the path of COLMAP as --colmap_executable, or omit the option "
                 "to use pycolmap"
             )
-        named = [line for line in (self._output("help") or "").splitlines() if line.startswith("COLMAP")]
+        named = [line for line in (self._read_output("help") or "").splitlines() if line.startswith("COLMAP")]
         if not named:
             raise UserError(
                 f"{executable} does not answer `help` as COLMAP does; pass the path of COLMAP as --colmap_executable, "
@@ -146,9 +154,9 @@ class Program(Backend):
         self._matcher = f"{'exhaustive' if settings.matcher == 'auto' else settings.matcher}_matcher"
         switch = "0" if settings.no_gpu else "1"
         # COLMAP 3.12 renamed these options when it got features other than SIFT.
-        self._gpu_for_features = [self._known("feature_extractor", "Extraction.use_gpu"), switch]
-        self._gpu_for_matching = [self._known(self._matcher, "Matching.use_gpu"), switch]
-        self._maps_globally = all(self._output(name, "-h") is not None for name in _GLOBAL)
+        self._gpu_for_features = [self._find_option("feature_extractor", "Extraction.use_gpu"), switch]
+        self._gpu_for_matching = [self._find_option(self._matcher, "Matching.use_gpu"), switch]
+        self._maps_globally = all(self._read_output(name, "-h") is not None for name in _GLOBAL)
         if settings.mapper == "global" and not self._maps_globally:
             raise UserError(
                 f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or omit "
@@ -158,6 +166,11 @@ class Program(Backend):
             self.ways = ("global", "incremental") if self._maps_globally else ("incremental",)
 
     def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
+        """Return the commands that write SIFT features into the database: one for each group of photos.
+
+        groups: names of the photos that share a camera, group by group.
+        masks: true if the photos have masks.
+        """
         commands = []
         mode = "single_camera"
         if all(len(names) == 1 for names in groups):  # one command does, instead of one for each photo
@@ -167,7 +180,7 @@ class Program(Backend):
             with atomic_write(listed) as temporary:
                 temporary.write_text("".join(f"{name}\n" for name in names), encoding="utf-8")
             command = [
-                *self._start("feature_extractor", self.layout.database),
+                *self._begin_command("feature_extractor", self.layout.database),
                 *("--image_path", str(self.layout.prepared)),
                 *("--image_list_path", str(listed)),
                 *("--ImageReader.camera_model", self.settings.camera),
@@ -179,27 +192,34 @@ class Program(Backend):
         return commands
 
     def matching(self) -> list[Command]:
-        return [self._start(self._matcher, self.layout.database) + self._gpu_for_matching]
+        return [self._begin_command(self._matcher, self.layout.database) + self._gpu_for_matching]
 
     def calibration(self) -> list[Command]:
         calibrator, _ = _GLOBAL
-        return [self._start(calibrator, self.layout.calibrated)] if self._maps_globally else super().calibration()
+        return (
+            [self._begin_command(calibrator, self.layout.calibrated)] if self._maps_globally else super().calibration()
+        )
 
     def mapping(self, way: str, models: Path) -> list[Command]:
+        """Return the command that maps the photos.
+
+        way: "global" or "incremental".
+        models: folder to make, which gets one sub-folder per model.
+        """
         models.mkdir(parents=True)
         paths = ["--image_path", str(self.layout.prepared), "--output_path", str(models)]
         if way == "global":
-            return [[*self._start(_GLOBAL[1], self.layout.calibrated), *paths]]
-        started = self._start("mapper", self.layout.database)
+            return [[*self._begin_command(_GLOBAL[1], self.layout.calibrated), *paths]]
+        started = self._begin_command("mapper", self.layout.database)
         return [[*started, *paths, "--Mapper.ba_global_function_tolerance", str(TOLERANCE)]]
 
-    def _start(self, name: str, database: Path) -> Command:
+    def _begin_command(self, name: str, database: Path) -> Command:
         return [self._executable, name, "--database_path", str(database)]
 
-    def _known(self, name: str, option: str) -> str:
+    def _find_option(self, name: str, option: str) -> str:
         """Return an option of features or of SIFT, as the help of a command lists it. UserError if it lists none."""
         options = f"--Feature{option}", f"--Sift{option}"
-        text = self._output(name, "-h") or ""
+        text = self._read_output(name, "-h") or ""
         for known in options:
             if known in text:
                 return known
@@ -208,7 +228,7 @@ class Program(Backend):
             "supported; omit --colmap_executable to use pycolmap"
         )
 
-    def _output(self, *arguments: str) -> str | None:
+    def _read_output(self, *arguments: str) -> str | None:
         """Return the program's output; None if it fails."""
         command = [self._executable, *arguments]
         try:
@@ -223,18 +243,18 @@ class Program(Backend):
 
 def count_rows(database: Path, table: str) -> int:
     """Count the rows of a table; 0 while it does not exist or is locked."""
-    rows = _query(database, f"SELECT COUNT(*) FROM {table}")
+    rows = _query_database(database, f"SELECT COUNT(*) FROM {table}")
     return rows[0][0] if rows else 0
 
 
 def list_photos(database: Path) -> list[str]:
     """List the photos of a database, sorted."""
-    return sorted(name for (name,) in _query(database, "SELECT name FROM images"))
+    return sorted(name for (name,) in _query_database(database, "SELECT name FROM images"))
 
 
 def count_most_features(database: Path) -> int:
     """Return the largest number of features of a photo."""
-    rows = _query(database, "SELECT MAX(rows) FROM keypoints")
+    rows = _query_database(database, "SELECT MAX(rows) FROM keypoints")
     return (rows[0][0] or 0) if rows else 0
 
 
@@ -258,16 +278,17 @@ def copy_database(database: Path, target: Path) -> None:
 
 def count_partners(database: Path) -> dict[str, int]:
     """Count, for every photo, the other photos with which its matches passed the geometric check."""
-    names = dict(_query(database, "SELECT image_id, name FROM images"))
+    names = dict(_query_database(database, "SELECT image_id, name FROM images"))
     counts = Counter({name: 0 for name in names.values()})
-    for (pair,) in _query(database, "SELECT pair_id FROM two_view_geometries WHERE rows > 0"):
+    for (pair,) in _query_database(database, "SELECT pair_id FROM two_view_geometries WHERE rows > 0"):
         for image in divmod(pair, _PAIR):
             if image in names:
                 counts[names[image]] += 1
     return dict(counts)
 
 
-def _query(database: Path, statement: str) -> list[tuple]:
+def _query_database(database: Path, statement: str) -> list[tuple]:
+    """Return the rows that an SQL statement selects; none while the database is missing, locked or without tables."""
     if not database.is_file():
         return []
     with contextlib.suppress(sqlite3.Error):

@@ -65,7 +65,7 @@ def convert(layout: Layout, settings: Settings, args: argparse.Namespace) -> Non
         print(f"warning: {FRAMES_MISSING}", file=sys.stderr)
     kept = []
     if videos:
-        kept = record.run([_video_stage(layout, videos, args)])
+        kept = record.run([_make_video_stage(layout, videos, args)])
         print("\n".join(describe_videos(layout)))
         found = find_images(layout, args.skip_unreadable, but=videos)
     for line in describe_unused(found.unused):
@@ -182,6 +182,7 @@ def _check_masks(given: str | None) -> Path | None:
 
 
 def _check_videos(given: Sequence[str]) -> list[Path]:
+    """Return the paths of the videos of --video. UserError for one that is no file."""
     videos = [Path(name) for name in given]
     for path in videos:
         if not path.is_file():
@@ -189,7 +190,7 @@ def _check_videos(given: Sequence[str]) -> list[Path]:
     return videos
 
 
-def _video_stage(layout: Layout, videos: Sequence[Path], args: argparse.Namespace) -> stages.Stage:
+def _make_video_stage(layout: Layout, videos: Sequence[Path], args: argparse.Namespace) -> stages.Stage:
     """Make the stage of the videos. UserError for photos beside them that cannot be used, before minutes of work."""
     if layout.input.is_dir():
         sort_inputs(layout.input, args.skip_unreadable, but=videos)

@@ -53,7 +53,10 @@ class View(NamedTuple):
 def add_points(folder: Path, shared: Mapping[str, Mapping[str, int]], no_gpu: bool) -> int:
     """Add points without tracks to the model in `sparse` of a folder, whose photos are in `images`; return how many.
 
-    Photos with other cameras than pinholes get none. shared: as of `find_points`.
+    Photos with other cameras than pinholes get none.
+
+    shared: for each photo, the names of other photos and the number of points that both show.
+    no_gpu: true to compute on the CPU.
     """
     import pycolmap  # after Pillow
 
@@ -73,13 +76,14 @@ def find_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Find points (N, 3) of a COLMAP model with pinhole cameras, and their colours (N, 3) uint8.
 
-    photos: folder of its photos. shared: for each photo the names of others and the number of points they share.
+    photos: folder of the model's photos.
+    shared: for each photo, the names of other photos and the number of points that both show.
     """
     images = {image.name: image for image in (model.images[number] for number in model.reg_image_ids())}
     each = int(np.clip(_MOST // max(len(images), 1), *_EACH))
     # Far from the origin, as maps are, float32 has few digits left.
     origin = np.mean([image.projection_center() for image in images.values()], axis=0) if images else np.zeros(3)
-    depths = {name: _depths(model, image) for name, image in images.items()}
+    depths = {name: _measure_depths(model, image) for name, image in images.items()}
     others = {name: _choose_others(images, name, shared.get(name, {}), depths[name]) for name in sorted(images)}
     names = [name for name, found in others.items() if len(found) >= 2]
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3), np.uint8)]
@@ -90,7 +94,7 @@ def find_points(
             wanted = sorted({*part, *(other for name in part for other in others[name])})
             views = {name: views[name] for name in wanted if name in views}
             new = [name for name in wanted if name not in views]
-            load = partial(_load, images, photos, origin, device)
+            load = partial(_load_view, images, photos, origin, device)
             views |= zip(new, in_threads(load, new, disable=True), strict=True)
             for number, name in enumerate(part, start):
                 beside = [views[other] for other in others[name]]
@@ -101,7 +105,7 @@ def find_points(
     return np.concatenate(points) + origin, np.concatenate(colors)
 
 
-def _depths(model: Any, image: Any) -> np.ndarray:
+def _measure_depths(model: Any, image: Any) -> np.ndarray:
     """Depths (P,) of some of the points that a photo shows."""
     numbers = image.get_observation_point2D_idxs()
     seen = [image.point2D(number).point3D_id for number in numbers[:: max(len(numbers) // _ASKED, 1)]]
@@ -122,7 +126,13 @@ def _choose_others(images: Mapping[str, Any], name: str, shared: Mapping[str, in
     return chosen[:_OTHERS]
 
 
-def _load(images: Mapping[str, Any], folder: Path, origin: np.ndarray, device: torch.device, name: str) -> View:
+def _load_view(images: Mapping[str, Any], folder: Path, origin: np.ndarray, device: torch.device, name: str) -> View:
+    """Load a photo, at most SIDE pixels long, with its pose and intrinsics at that size.
+
+    images: the model's photos by name, each with pose and camera.
+    folder: of the photos.
+    origin: (3,) point of the world that becomes 0, so that float32 suffices.
+    """
     image = images[name]
     with open_image(folder / name) as photo:
         scale = min(1.0, SIDE / max(photo.size))
@@ -159,7 +169,7 @@ def _find_points_of_photo(
     shift = (0.5 * (near[0] - near[2]) / bend).clamp(-1, 1)  # of the parabola through the three
     inverse = fine.gather(1, best[:, None] + 1)[:, 0] + shift * (2 * width / (_STEPS - 1))
     kept = (score > _AGREE) & (inverse > 0)
-    rays = _rays(view.intrinsics, pixels[kept] + 0.5)
+    rays = _cast_rays(view.intrinsics, pixels[kept] + 0.5)
     points = (rays / inverse[kept, None] - view.translation) @ view.rotation
     columns, rows = pixels[kept].cpu().numpy().astype(int).T
     return points.double().cpu().numpy(), view.colors[rows, columns]
@@ -194,7 +204,7 @@ def _measure_agreement(
     offsets = torch.stack(torch.meshgrid(offsets, offsets, indexing="xy"), -1).reshape(-1, 2)
     places = pixels[:, None] + 0.5 + offsets  # (P, K, 2)
     own = _normalize_patches(_sample(view.grey, places[:, None], factor))
-    rays = _rays(view.intrinsics, places)[:, None]  # (P, 1, K, 3)
+    rays = _cast_rays(view.intrinsics, places)[:, None]  # (P, 1, K, 3)
     found = []
     for other in others:
         turn = other.rotation @ view.rotation.T
@@ -225,7 +235,7 @@ def _normalize_patches(patches: torch.Tensor) -> torch.Tensor:
     return patches / patches.norm(dim=-1, keepdim=True).clamp_min(1e-4)
 
 
-def _rays(intrinsics: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+def _cast_rays(intrinsics: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
     """Rays (..., 3) of depth 1 through places (..., 2) in pixels."""
     flat = (places - intrinsics[:2, 2]) / torch.stack([intrinsics[0, 0], intrinsics[1, 1]])
     return torch.cat([flat, torch.ones_like(flat[..., :1])], -1)

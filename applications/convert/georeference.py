@@ -69,11 +69,12 @@ def fit_level_frame(cameras: Cameras, up: np.ndarray | None = None) -> Fit:
     up: (3,), a vertical of the world that is measured, and stays.
     """
     if up is not None:
-        return _refine_fit(cameras, _upright_rotation(up), measured=True)
+        return _refine_fit(cameras, _find_upright_rotation(up), measured=True)
     normal = np.linalg.svd(cameras.centers - cameras.centers.mean(0))[2][2]
     level = find_level_up(cameras.turns)
     found = sorted(
-        (_refine_fit(cameras, _upright_rotation(one)) for one in (level, -level, normal, -normal)), key=lambda f: f.cost
+        (_refine_fit(cameras, _find_upright_rotation(one)) for one in (level, -level, normal, -normal)),
+        key=lambda f: f.cost,
     )
     equal = [one for one in found if one.cost < found[0].cost + _EQUAL]
     if all(one.rotation[1] @ found[0].rotation[1] > 0 for one in equal):
@@ -105,7 +106,7 @@ def find_level_up(turns: np.ndarray) -> np.ndarray:
     return up
 
 
-def _upright_rotation(up: np.ndarray) -> np.ndarray:
+def _find_upright_rotation(up: np.ndarray) -> np.ndarray:
     """The least rotation (3,3) that takes a direction to -y."""
     from scipy.spatial.transform import Rotation
 
@@ -158,8 +159,8 @@ def _refine_fit(cameras: Cameras, rotation: np.ndarray, measured: bool = False) 
     common, deviations = np.zeros(2), (GPS_ERROR, HEIGHT_ERROR)
     free = np.full(9, _UNKNOWN)  # weights of the unknowns without evidence
     for _ in range(_ROUNDS):
-        level = [] if measured else _level_rows(rotation @ cameras.turns, common)
-        gps, deviations, away = _gps_rows(cameras, rotation, scale, shift, deviations)
+        level = [] if measured else _make_level_rows(rotation @ cameras.turns, common)
+        gps, deviations, away = _make_gps_rows(cameras, rotation, scale, shift, deviations)
         free[7] = 1 / (_COMMON**2 + common[0] ** 2)  # Cauchy's, as a mount may be crooked
         alone = sum((rows.matrix for rows in level), np.diag(free))
         matrix = sum((rows.matrix for rows in gps), alone)
@@ -174,13 +175,13 @@ def _refine_fit(cameras: Cameras, rotation: np.ndarray, measured: bool = False) 
             break
     variances, without_gps = map(np.linalg.inv, (matrix, alone))
     tilt, by_level = (float(np.sqrt(one[TILT, TILT].sum())) for one in (variances, without_gps))
-    cost = (_TAIL + 2) / 2 * np.log1p(_distances(away, GPS_ERROR, HEIGHT_ERROR) / _TAIL)
+    cost = (_TAIL + 2) / 2 * np.log1p(_measure_distances(away, GPS_ERROR, HEIGHT_ERROR) / _TAIL)
     cost = float(np.nansum(cost) + sum(np.log1p((rows.away / ROLL) ** 2).sum() for rows in level[:1]))
-    fits = _distances(away, *deviations) < _FAR**2  # NaN is not
+    fits = _measure_distances(away, *deviations) < _FAR**2  # NaN is not
     return Fit(rotation, scale, shift, tilt, by_level, float(np.sqrt(variances[3, 3])), fits, cost)
 
 
-def _level_rows(axes: np.ndarray, common: np.ndarray) -> list[_Rows]:
+def _make_level_rows(axes: np.ndarray, common: np.ndarray) -> list[_Rows]:
     """Rolls and, of a gimbal, pitches. axes: (N,3,3), camera to level frame. common: of all, where the fit stands."""
     down = axes[:, 1]  # in each camera's axes
     middle = np.median(down, axis=0)
@@ -200,14 +201,14 @@ def _level_rows(axes: np.ndarray, common: np.ndarray) -> list[_Rows]:
     return found
 
 
-def _gps_rows(
+def _make_gps_rows(
     cameras: Cameras, rotation: np.ndarray, scale: float, shift: np.ndarray, deviations: tuple[float, float]
 ) -> tuple[list[_Rows], tuple[float, float], np.ndarray]:
     """East, north and down of places; their standard deviations; and by how much (N,3) they are away, in metres."""
     own = scale * cameras.centers @ rotation.T
     away = own + shift - cameras.places
     here = np.isfinite(away[:, 0])
-    distances = _distances(away, *deviations)
+    distances = _measure_distances(away, *deviations)
     weights = (_TAIL + 2) / (_TAIL + np.nan_to_num(distances))
     weights[~here] = 0
     (x, y, z), count = np.nan_to_num(away.T), int(here.sum())
@@ -227,6 +228,6 @@ def _gps_rows(
     return rows, (float(np.sqrt(flat)), float(np.sqrt(high))), away
 
 
-def _distances(away: np.ndarray, flat: float, high: float) -> np.ndarray:
+def _measure_distances(away: np.ndarray, flat: float, high: float) -> np.ndarray:
     """Squared distances (N,) of places in standard deviations; NaN without GPS."""
     return (away[:, 0] ** 2 + away[:, 2] ** 2) / flat**2 + np.nan_to_num(away[:, 1]) ** 2 / high**2

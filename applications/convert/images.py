@@ -64,7 +64,7 @@ def name_prepared(layout: Layout, names: Sequence[str]) -> dict[str, str]:
     for name in names:
         found[name] = name
         with contextlib.suppress(*UNREADABLE), open_image(layout.input / name) as image:
-            target = _prepared_path(image, layout.prepared / name, taken)
+            target = _choose_path(image, layout.prepared / name, taken)
             found[name] = target.relative_to(layout.prepared).as_posix()
     return found
 
@@ -147,11 +147,11 @@ def resize_images(layout: Layout, factor: int) -> None:
 
 
 def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
-    """Write the prepared photo and return its path, `_prepared_path`. taken: paths of other photos."""
+    """Write the prepared photo and return its path, `_choose_path`. taken: paths of other photos."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         with open_image(source) as image:
-            target = _prepared_path(image, target, taken)
+            target = _choose_path(image, target, taken)
             if (
                 image.format in _LINKED
                 and image.getexif().get(_ORIENTATION, 1) in (0, 1)
@@ -168,9 +168,9 @@ def _prepare_image(source: Path, target: Path, taken: Collection[Path]) -> Path:
         raise UserError(f"cannot rewrite the photo {source} for COLMAP ({error}); replace or remove it") from error
 
 
-def _prepared_path(image: Image.Image, target: Path, taken: Collection[Path]) -> Path:
+def _choose_path(image: Image.Image, target: Path, taken: Collection[Path]) -> Path:
     """The path of a prepared photo: `target`, with the suffix of its format appended if it has none."""
-    end = _ENDS[_written_format(image)]
+    end = _ENDS[_choose_format(image)]
     if target.suffix.lower() not in (set(SUFFIXES) - {".webp"} if image.format in _LINKED else {end}):
         target = target.with_name(target.name + end)
         while target in taken:
@@ -178,13 +178,14 @@ def _prepared_path(image: Image.Image, target: Path, taken: Collection[Path]) ->
     return target
 
 
-def _written_format(image: Image.Image) -> str:
+def _choose_format(image: Image.Image) -> str:
     """The format in which a photo is written."""
     written = _WRITTEN.get(image.format, "PNG")
     return "PNG" if written == "JPEG" and image.has_transparency_data else written
 
 
 def read_upright_size(photo: Path) -> tuple[int, int]:
+    """Read width and height of a photo as it is displayed, in pixels. UserError for an unreadable file."""
     width, height = picture_size(photo, colors=True)  # UserError for a truncated file or one of another kind
     try:
         with open_image(photo) as image:
@@ -195,6 +196,7 @@ def read_upright_size(photo: Path) -> tuple[int, int]:
 
 
 def _check_mask(mask: Path, name: str, size: tuple[int, int]) -> None:
+    """Raise UserError if a mask has not the size (width, height) of its photo, in pixels."""
     found = picture_size(mask)
     if found != size:
         raise UserError(
@@ -222,7 +224,7 @@ def _save_srgb(image: Image.Image, target: Path, like: Image.Image, **options: o
     image = to_srgb(image)
     if profile := image.info.get("icc_profile"):
         options["icc_profile"] = profile
-    written = _written_format(like)
+    written = _choose_format(like)
     if written == "JPEG":
         options |= {"quality": JPEG_QUALITY, "subsampling": 0}
     image.save(target, written, **options)

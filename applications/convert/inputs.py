@@ -49,7 +49,7 @@ def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path]
     paths = folder.rglob("*") if below else (path for path in folder.iterdir() if not path.is_dir())
     files = [path for path in sorted(paths) if path.is_file() or path.is_symlink()]
     seen = [path for path in files if not any(part.startswith(".") for part in path.relative_to(folder).parts)]
-    kinds = {path: _kind(path, skip_unreadable) for path in seen if path.absolute() not in absent}
+    kinds = {path: _find_kind(path, skip_unreadable) for path in seen if path.absolute() not in absent}
     stems = {path.with_suffix(""): path.name for path, kind in kinds.items() if kind.format not in (*_OFTEN_DOUBLE, "")}
     photos, unused, unreadable = [], {}, {}
     for path, kind in kinds.items():
@@ -86,7 +86,11 @@ class _Kind(NamedTuple):
     reason: str
 
 
-def _kind(path: Path, thorough: bool) -> _Kind:
+def _find_kind(path: Path, thorough: bool) -> _Kind:
+    """Find the kind of a file by its first bytes, its suffix and, of a picture, its content.
+
+    thorough: decode pictures, too, to find damaged ones.
+    """
     suffix = path.suffix.lower()
     if not path.is_file():
         return _Kind("unknown", _LINK)
@@ -99,21 +103,21 @@ def _kind(path: Path, thorough: bool) -> _Kind:
     if suffix in RAW_SUFFIXES or brand == b"crx ":
         return _Kind("RAW", _DEVELOP)
     if brand in _HEIF:
-        return _heif_kind(path, thorough)
+        return _find_heif_kind(path, thorough)
     video = brand or head.startswith(_VIDEO_STARTS) or (head[:4], head[8:12]) == (b"RIFF", b"AVI ")
     if video or suffix in VIDEO_SUFFIXES:
         return _Kind("", "video: pass it as --video to take frames of it")
-    return _picture_kind(path, thorough)
+    return _find_picture_kind(path, thorough)
 
 
-def _heif_kind(path: Path, thorough: bool) -> _Kind:
+def _find_heif_kind(path: Path, thorough: bool) -> _Kind:
     """Return the kind of a HEIC or AVIF file, which share a container format."""
     if (points := code_points(plain_path(path), "HEIF")) and points[1] in HDR:
         return _Kind("HEIF", _HDR)
     if not _is_complete(path):
         return _Kind("HEIF", _DAMAGED)
     readable = _enable_heif()
-    kind = _picture_kind(path, thorough)
+    kind = _find_picture_kind(path, thorough)
     return _Kind("HEIF", _INSTALL) if kind.reason and not readable else kind
 
 
@@ -130,7 +134,8 @@ def _is_complete(path: Path) -> bool:
     return place == size
 
 
-def _picture_kind(path: Path, thorough: bool) -> _Kind:
+def _find_picture_kind(path: Path, thorough: bool) -> _Kind:
+    """Find the kind of a file by what Pillow makes of it. thorough: decode all of the picture, too."""
     suffix = path.suffix.lower()
     try:
         with open_image(path) as image:

@@ -16,6 +16,7 @@ class Layout:
     """Paths of one conversion: `input`, the photos, which are only read; `work`, intermediate results; the scene."""
 
     def __init__(self, scene: Path) -> None:
+        """Name the paths of a conversion. scene: folder of the scene, with the folder `input`."""
         self.scene = scene
         self.input, self.images, self.sparse = scene / "input", scene / "images", scene / "sparse"
         self.report, self.page = scene / "convert_report.json", scene / "capture.html"
@@ -90,7 +91,7 @@ def find_images(layout: Layout, skip_unreadable: bool = False, but: Iterable[Pat
     UserError if there are too few photos, if some cannot be read, or if they are in another folder.
     """
     if not layout.input.is_dir():
-        raise UserError(_no_input(layout))
+        raise UserError(_explain_no_input(layout))
     made = layout.report, layout.page, layout.orientation
     found = sort_inputs(layout.input, skip_unreadable, (*but, *made), below=layout.input != layout.scene)
     if len(found.photos) < FEWEST:
@@ -106,7 +107,8 @@ def image_names(folder: Path) -> list[str]:
     return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if _is_image(path))
 
 
-def _no_input(layout: Layout) -> str:
+def _explain_no_input(layout: Layout) -> str:
+    """Return the message for a scene without the folder `input`, by what lies there instead."""
     scene = layout.scene
     if scene.name == "input":
         return f"{scene} is the folder of the photos itself; pass its parent folder as -s: {scene.parent}"

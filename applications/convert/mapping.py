@@ -1,6 +1,7 @@
 """Mapping in several ways, until a model agrees with the pairs of photos that it was made from (scene/agreement.py).
 
 Each way fails on some captures, without saying so. The best model is kept, without photos that contradict the others.
+A pair is two photos whose matches passed a geometric check of the pair alone.
 """
 
 import shutil
@@ -58,7 +59,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
             break
         if number + 1 < len(ways):
             print(f"{_describe_try(tried[-1])}; trying {way_name(ways[number + 1])}")
-    tried = sorted(tried, key=partial(_rank_key, tried), reverse=True)
+    tried = sorted(tried, key=partial(_rank_model, tried), reverse=True)
     best = tried[0]
     if "failed" in best:
         if not any((layout.tried / best["way"]).glob("*/*")):
@@ -103,7 +104,7 @@ def _judge_models(backend: Backend, models: Path, run: Callable[..., None]) -> d
     return read_json(out)
 
 
-def _rank_key(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
+def _rank_model(tried: Sequence[Mapping[str, Any]], found: Mapping[str, Any]) -> tuple[bool, bool, int, int]:
     """Return a sort key of how good a model is among those that were tried.
 
     A model that is far smaller than another may be right by chance. A model that lacks photos of a folded one may be
@@ -120,6 +121,7 @@ def way_name(way: str) -> str:
 
 
 def _describe_try(found: Mapping[str, Any]) -> str:
+    """Return, in a few words, why the model of one way of mapping was not accepted. found: its judgement."""
     if "failed" in found:
         return f"{way_name(found['way'])} failed"
     if not found.get("photos"):

@@ -27,7 +27,7 @@ def orient_scene(layout: Layout) -> None:
     images = sorted(read_model(layout.sparse / "0").images, key=lambda image: image.name)
     turns = np.stack([image.qvec2rotmat().T for image in images])
     centers = np.stack([-turn @ image.tvec for turn, image in zip(turns, images, strict=True)])
-    photos = [read_place(_source_photo(layout, image.name)) for image in images]
+    photos = [read_place(_find_source_photo(layout, image.name)) for image in images]
     middle, (reference, places) = np.median(centers, axis=0), _locate_photos(photos)
     cameras = Cameras(turns, centers - middle, places)
     vertical, found = _find_vertical(cameras, photos)
@@ -36,7 +36,7 @@ def orient_scene(layout: Layout) -> None:
     if _is_metric(found, cameras):
         scale = found.scale
         record |= {"unit": "metre", "scale_error": found.size, "gps_photos": int(found.fits.sum())}
-        record |= {"gps_error": _gps_error(found, cameras)} | (
+        record |= {"gps_error": _estimate_gps_error(found, cameras)} | (
             _locate_middle(found, reference) if vertical["vertical"] else {}
         )
     translation = -scale * rotation @ middle
@@ -107,7 +107,7 @@ def _locate_photos(photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, np.ndarray
     if not here.any():
         return np.zeros(3), places
     filled = np.where(np.isfinite(gps[here]), gps[here], np.median(heights) if len(heights) else 0.0)
-    earth = _earth()
+    earth = _find_earth()
     # Not the median of degrees, which is far away from photos around a pole or at a longitude of 180 degrees.
     reference = earth.ecef_to_ellipsoid(np.median(earth.ellipsoid_to_ecef(filled), axis=0)[None])[0]
     places[here] = earth.ellipsoid_to_enu(filled, *reference)[:, [0, 2, 1]] * [1, -1, 1]
@@ -115,13 +115,13 @@ def _locate_photos(photos: Sequence[PhotoPlace]) -> tuple[np.ndarray, np.ndarray
     return reference, places
 
 
-def _earth() -> Any:
+def _find_earth() -> Any:
     import pycolmap
 
     return pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
 
 
-def _gps_error(found: Fit, cameras: Cameras) -> float:
+def _estimate_gps_error(found: Fit, cameras: Cameras) -> float:
     """Return the mean distance along the ground, in metres, of the places that fit from their GPS."""
     away = found.scale * cameras.centers @ found.rotation.T + found.shift - cameras.places
     return float(np.hypot(away[found.fits, 0], away[found.fits, 2]).mean())
@@ -130,7 +130,7 @@ def _gps_error(found: Fit, cameras: Cameras) -> float:
 def _locate_middle(found: Fit, reference: np.ndarray) -> dict[str, float]:
     """Return the place on Earth of the middle of the photos."""
     east, down, north = found.shift
-    place = _earth().enu_to_ellipsoid(np.array([[east, north, -down]]), *reference)[0]
+    place = _find_earth().enu_to_ellipsoid(np.array([[east, north, -down]]), *reference)[0]
     return dict(zip(PLACE, place.tolist(), strict=True))
 
 
@@ -151,7 +151,7 @@ def _measure_up(turns: np.ndarray, level: Fit, photos: Sequence[PhotoPlace]) -> 
     return up / np.linalg.norm(up), f"gravity of {len(ups)} photos"
 
 
-def _source_photo(layout: Layout, name: str) -> Path:
+def _find_source_photo(layout: Layout, name: str) -> Path:
     """Return the file that a photo of the model was made from, which still has all EXIF data."""
     kept = layout.input / name
     changed = kept.with_name(kept.stem)  # without the suffix that was appended for COLMAP

@@ -39,7 +39,7 @@ def compare_brightness(looks: Mapping[str, Look], layout: Layout) -> dict[str, L
     images = [image for image in model.images if image.name in looks]
     sizes = [(model.cameras[image.camera_id].width, model.cameras[image.camera_id].height) for image in images]
     seen = in_threads(
-        lambda image, size: _colors_at_points(layout.images / image.name, image.xys / size, image.point3D_ids),
+        lambda image, size: _read_colors(layout.images / image.name, image.xys / size, image.point3D_ids),
         images, sizes, desc="Comparing photos",
     )  # fmt: skip
     enough = [number for number, (points, _) in enumerate(seen) if len(points) >= SHARED]
@@ -53,7 +53,7 @@ def compare_brightness(looks: Mapping[str, Look], layout: Layout) -> dict[str, L
     return {**looks, **found}
 
 
-def _colors_at_points(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _read_colors(path: Path, places: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers (K,) of the points that a photo shows, and their colours (K, 3) in [0, 1].
 
     places: (P, 2), parts of the photo's width and height.

@@ -40,11 +40,12 @@ def run_programs(
     UserError with the last line of the output if a command fails. Ctrl-C and SIGTERM end the command first.
     """
     with Bar(total=total, desc=title, dynamic_ncols=True) as bar, open(log, "ab") as output:
-        _lock(output)
+        _lock_log(output)
 
         start = time.monotonic()
 
         def look() -> None:
+            """Move the bar, and show a guess at the time to go."""
             bar.update(min(max(done(), bar.n), total) - bar.n)
             if later and bar.n > _TOLD * total:
                 whole = (time.monotonic() - start) * total / bar.n
@@ -52,10 +53,10 @@ def run_programs(
                 bar.set_postfix_str(f"about {bar.format_interval(to_go)} for all", refresh=False)
 
         for command in commands:
-            status = _run(command, output, look)
+            status = _run_command(command, output, look)
             if status:
                 raise UserError(
-                    f"{title.lower()} failed (status {status}: {_last_words(log)}); all output is in {log}{hint}"
+                    f"{title.lower()} failed (status {status}: {_read_last_line(log)}); all output is in {log}{hint}"
                 )
         bar.update(total - bar.n)  # the commands are done, whether or not `done` could count everything
 
@@ -64,10 +65,10 @@ def refuse_while_working(log: Path) -> None:
     """Raise UserError while a program of an earlier or another run still works and writes to this log."""
     if log.is_file():
         with open(log, "rb") as output:
-            _lock(output)
+            _lock_log(output)
 
 
-def _lock(output: BinaryIO) -> None:
+def _lock_log(output: BinaryIO) -> None:
     """Lock a log, for this process and the programs that get it as their output, until the last of them has ended."""
     deadline = time.monotonic() + _ORPHAN_PATIENCE
     while True:
@@ -85,7 +86,12 @@ def _lock(output: BinaryIO) -> None:
         time.sleep(0.05)
 
 
-def _run(command: Sequence[str], output: BinaryIO, look: Callable[[], None]) -> int:
+def _run_command(command: Sequence[str], output: BinaryIO, look: Callable[[], None]) -> int:
+    """Run a command until it ends, and return its exit status; a signal ends the command, and is raised then.
+
+    output: the log.
+    look: called several times a second meanwhile.
+    """
     with DeferredInterrupt() as interrupt:
         try:
             process = subprocess.Popen(
@@ -103,11 +109,12 @@ def _run(command: Sequence[str], output: BinaryIO, look: Callable[[], None]) -> 
                     return process.returncode
                 look()
         finally:
-            _end(process)
+            _end_process(process)
             process.stdin.close()
 
 
-def _end(process: subprocess.Popen) -> None:
+def _end_process(process: subprocess.Popen) -> None:
+    """End a process that still runs: by SIGTERM, and after _PATIENCE seconds by SIGKILL."""
     if process.poll() is not None:
         return
     process.terminate()
@@ -118,6 +125,6 @@ def _end(process: subprocess.Popen) -> None:
         time.sleep(0.02)
 
 
-def _last_words(log: Path) -> str:
+def _read_last_line(log: Path) -> str:
     lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     return lines[-1][:300] if lines else "no output"

@@ -38,10 +38,17 @@ def reduce_photos(photos: Path, target: Path, names: Sequence[str], longest: int
     size: width and height, if they are to be those of a camera that is known.
     """
     with ThreadPoolExecutor(min(os.cpu_count() or 1, _THREADS)) as pool:
-        list(pool.map(partial(_reduce, photos, target, longest, size), names))
+        list(pool.map(partial(_reduce_photo, photos, target, longest, size), names))
 
 
-def _reduce(photos: Path, target: Path, longest: int, size: tuple[int, int] | None, name: str) -> None:
+def _reduce_photo(photos: Path, target: Path, longest: int, size: tuple[int, int] | None, name: str) -> None:
+    """Write the copy of one photo for `reduce_photos`, unless there is one.
+
+    photos, target: folders of the photos and of the copies.
+    longest: pixels of the longer side, at most.
+    size: width and height of the copy where they are given.
+    name: of the photo, in both folders.
+    """
     source, copy = photos / name, target / name
     if copy.exists():
         return

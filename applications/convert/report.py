@@ -1,4 +1,9 @@
-"""Report of a conversion: its models, the photos that were placed, its lenses."""
+"""Report of a conversion: its models, the photos that were placed, its lenses.
+
+Its entry `unusable` is the verdict: why the scene should not be trained, or null (checks.py, `why_unusable`). The
+survey
+is what the models of the mapper contain, as a file of worker.py (its step survey), which `read_survey` reads.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePath
@@ -13,7 +18,7 @@ from utils.system_utils import UserError
 class Model(NamedTuple):
     """One model of the mapper. registered: names of photos; track_length: mean views per point; error: mean, pixels.
 
-    cameras: id, model, size, params, and photos, by name what worker.py's _refit finds.
+    cameras: id, model, size, params, and photos, by name the result of worker.py's `_probe_focal_length`.
     """
 
     folder: str
@@ -64,7 +69,13 @@ def describe_lenses(report: dict[str, Any]) -> str:
 def write_report(
     path: Path, models: Sequence[Model], images: Sequence[str], partners: dict[str, int], **made: Any
 ) -> None:
-    """Write convert_report.json: photos placed and left out, models, the verdict, and `made`: settings, advice, ..."""
+    """Write convert_report.json: photos placed and left out, models, the verdict `unusable`, and `made`.
+
+    models: the chosen one first.
+    images: names of all photos.
+    partners: number of matching photos of each photo.
+    made: further entries: settings, advice, ...
+    """
     chosen = models[0]
     content = {
         **made,

@@ -63,6 +63,7 @@ class StageRecord:
     """
 
     def __init__(self, path: Path) -> None:
+        """Read the record of an earlier run, if there is one. UserError if that is damaged."""
         self._path = path
         self._record: dict[str, dict[str, Any]] = {}
         if path.is_file():
@@ -153,7 +154,7 @@ def image_stage(layout: Layout, names: list[str], masks: Path | None) -> Stage:
     return Stage(
         "photos",
         made_from,
-        reset=lambda: _remove(layout.prepared, layout.masks),
+        reset=lambda: _remove_paths(layout.prepared, layout.masks),
         work=lambda: images.prepare_images(layout, names, masks),
         check=lambda: images.check_images(layout, names, masks),
     )
@@ -164,7 +165,7 @@ def poses_stage(layout: Layout, source: Path) -> Stage:
     return Stage(
         "poses",
         [[str(path), file_state(path)] for path in list_pose_files(source)],
-        reset=lambda: _remove(layout.given),
+        reset=lambda: _remove_paths(layout.given),
         work=lambda: write_given(layout, source),
         check=lambda: find_posed_photos(layout, source) and None,
     )
@@ -181,6 +182,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
         run_programs(layout.log, commands, title, total, done, hint, _LATER.get(title, 0.0))
 
     def features() -> None:
+        """Write features of all photos into the database."""
         if settings.mapper == colmap.GIVEN:
             names = [list_given(layout)]
         else:
@@ -192,6 +194,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
         run(backend.features(names, masks), "Features", sum(map(len, names)), partial(rows, "keypoints"), hint)
 
     def matching() -> None:
+        """Match pairs of photos in the database."""
         count = rows("images")
         usual = range(1, count if count <= colmap.ALL_PAIRS else _USUAL)
         steps = {"sequential": _NEIGHBOURS, "auto": usual}.get(settings.matcher, range(1, count))
@@ -200,7 +203,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
 
     def mapping() -> None:
         def place(title: str, commands: list[colmap.Command]) -> None:
-            run(commands, title, rows("images"), _count_registered_since(layout.log))
+            run(commands, title, rows("images"), _make_registered_counter(layout.log))
 
         map_photos(backend, lambda commands, title: run(commands, title, 1, lambda: 0), place)
 
@@ -219,24 +222,25 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
     if settings.mapper == colmap.ADDING:
         features_from.append(read_base_state(layout))
     return [
-        Stage("features", features_from, lambda: _remove(*files, layout.small), features, check=check_sizes),
+        Stage("features", features_from, lambda: _remove_paths(*files, layout.small), features, check=check_sizes),
         Stage("matching", [settings.matcher], lambda: colmap.forget_matches(layout.database), matching, resumable=True),
-        Stage("mapping", [settings.mapper], lambda: _remove(*mapped), mapping),
+        Stage("mapping", [settings.mapper], lambda: _remove_paths(*mapped), mapping),
     ]
 
 
 def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, made_from: Any, **made: Any) -> Stage:
     """Make the stage that writes the largest model and its photos to `images` and `sparse/0`, and the report.
 
-    made: settings to report. record: of what goes with the scene of an earlier run, which stays until the new one is
-    complete.
+    record: of the stages, by which outputs of an earlier run are known. The scene of that run stays until the new one
+    is complete.
+    made_from: state of a model made elsewhere (--skip_matching), else None.
+    made: further entries of the report, such as settings.
     """
 
-    def work() -> None:
+    def write_scene() -> None:
+        """Write photos, model and report in the work folder, then put them in place of those of an earlier run."""
         root = layout.prepared if layout.prepared.is_dir() else layout.input
-        places = {"models": str(layout.models), "images": str(root), "out": str(layout.survey)}
-        survey = worker_command(layout, "survey", **places)
-        run_programs(layout.log, [survey], "Reading models", 1, layout.survey.exists)
+        _survey_models(layout, root)
         tried = report.read_tried(layout) if made_from is None else []  # else a model was made elsewhere
         models = report.read_survey(layout, tried)
         names = image_names(root)
@@ -247,18 +251,7 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         given = settings.mapper == colmap.GIVEN
         found = [*check_given_poses(chosen, names)] if given else []  # UserError before anything is replaced
         native = colmap.is_native(settings.lenses, {camera["model"] for camera in chosen.cameras})
-        paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
-        job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
-        command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
-        written = layout.undistorted / "images"
-        count, title = len(chosen.registered), "Copying photos" if native else "Undistorting"
-        run_programs(layout.log, [command], title, count, lambda: sum(p.is_file() for p in written.rglob("*")))
-        missing = [name for name in chosen.registered if not (written / name).is_file()]
-        if missing:
-            raise UserError(
-                f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
-                f"is {missing[0]}; put them there under the names that they have in the model"
-            )
+        _write_photos(layout, root, chosen, native)
         shared = {name: photo["shared"] for name, photo in read_json(layout.capture)["photos"].items()}
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
@@ -271,32 +264,67 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
             )
             found += check_shared_cameras(chosen.cameras, lenses, settings.cameras, video.list_taken_frames(layout))
         later = [path for name, paths in _list_outputs(layout).items() if record.begun(name) for path in paths]
-        whole = layout.undistorted / "whole"
-        mkdir_p(whole)
-        (layout.undistorted / "sparse").rename(whole / "0")
         made_of = {**made, "advice": [*map(str, found)], "cameras": cameras.describe_cameras(chosen.cameras, lenses)}
         made_of |= {"lenses": "native" if native else "undistort", "more_points": more, "tried": tried}
-        # `sparse` goes first and comes last: what has one has the photos, too, and the report with its verdict.
-        _remove(layout.sparse, layout.images, layout.report, *later)
-        written.rename(layout.images)
-        report.write_report(layout.report, models, names, matches, **made_of)
-        whole.rename(layout.sparse)
-        _remove(layout.undistorted)
+        _replace_scene(layout, later, partial(report.write_report, layout.report, models, names, matches, **made_of))
 
-    reset, makes = partial(_remove, layout.undistorted), [layout.images, layout.report, layout.sparse / "0"]
-    return Stage("undistortion", [made_from, settings.lenses], reset, work, makes=makes)
+    reset, makes = partial(_remove_paths, layout.undistorted), [layout.images, layout.report, layout.sparse / "0"]
+    return Stage("undistortion", [made_from, settings.lenses], reset, write_scene, makes=makes)
+
+
+def _survey_models(layout: Layout, root: Path) -> None:
+    """Write survey.json: what the mapper's models contain. root: folder of the photos."""
+    places = {"models": str(layout.models), "images": str(root), "out": str(layout.survey)}
+    survey = worker_command(layout, "survey", **places)
+    run_programs(layout.log, [survey], "Reading models", 1, layout.survey.exists)
+
+
+def _write_photos(layout: Layout, root: Path, chosen: report.Model, native: bool) -> None:
+    """Write the chosen model, its photos and capture.json into the work folder. UserError for missing photos.
+
+    root: folder of the photos.
+    native: true if they stay as they are; else they are undistorted.
+    """
+    paths = {"model": layout.models / chosen.folder, "images": root, "out": layout.undistorted}
+    job = {name: str(path) for name, path in (paths | {"capture": layout.capture}).items()}
+    command = worker_command(layout, "undistort", **job, native=native, jpeg_quality=images.JPEG_QUALITY)
+    written = layout.undistorted / "images"
+    count, title = len(chosen.registered), "Copying photos" if native else "Undistorting"
+    run_programs(layout.log, [command], title, count, lambda: sum(p.is_file() for p in written.rglob("*")))
+    missing = [name for name in chosen.registered if not (written / name).is_file()]
+    if missing:
+        raise UserError(
+            f"{len(missing)} photos of the model in {layout.models / chosen.folder} are not in {root}, the first "
+            f"is {missing[0]}; put them there under the names that they have in the model"
+        )
+
+
+def _replace_scene(layout: Layout, later: Sequence[Path], write_report: Callable[[], None]) -> None:
+    """Put photos and model of the work folder in the place of the scene's, and write the report.
+
+    later: outputs of the stages after this one, which become invalid.
+    """
+    whole = layout.undistorted / "whole"
+    mkdir_p(whole)
+    (layout.undistorted / "sparse").rename(whole / "0")
+    # `sparse` goes first and comes last: what has one has the photos, too, and the report on whether to train on them.
+    _remove_paths(layout.sparse, layout.images, layout.report, *later)
+    (layout.undistorted / "images").rename(layout.images)
+    write_report()
+    whole.rename(layout.sparse)
+    _remove_paths(layout.undistorted)
 
 
 def resize_stage(layout: Layout) -> Stage:
     """Make the stage that writes smaller copies of the photos: images_2, images_4, images_8."""
 
-    def work() -> None:
+    def write_copies() -> None:
         for factor in FACTORS:
-            _remove(layout.resized(factor))
+            _remove_paths(layout.resized(factor))
             images.resize_images(layout, factor)
 
     # No reset: undistortion removes the copies when it replaces the photos that they were made from.
-    return Stage("resize", list(FACTORS), lambda: None, work)
+    return Stage("resize", list(FACTORS), lambda: None, write_copies)
 
 
 def requested_stages(layout: Layout, record: StageRecord, args: argparse.Namespace) -> list[Stage]:
@@ -319,7 +347,7 @@ def _list_outputs(layout: Layout) -> dict[str, list[Path]]:
 
 def orient_stage(layout: Layout) -> Stage:
     """Make the stage that finds where the scene is upright."""
-    return Stage("orient", 1, lambda: _remove(layout.orientation), lambda: orient_scene(layout))
+    return Stage("orient", 1, lambda: _remove_paths(layout.orientation), lambda: orient_scene(layout))
 
 
 def read_model_state(layout: Layout) -> list[Any]:
@@ -330,8 +358,13 @@ def read_model_state(layout: Layout) -> list[Any]:
     return [[str(path.relative_to(layout.models)), *file_state(path)] for path in files]
 
 
-def _count_registered_since(log: Path) -> Callable[[], int]:
-    """Return a function that counts the photos placed since now, according to the mapper's log."""
+def _make_registered_counter(log: Path) -> Callable[[], int]:
+    """Make a function that counts the photos placed since now.
+
+    log: COLMAP's log. Each call reads on where the one before stopped, and returns the largest count that the mapper
+    has
+    written there so far.
+    """
     position = log.stat().st_size if log.is_file() else 0
     most = 0
 
@@ -350,7 +383,8 @@ def _count_registered_since(log: Path) -> Callable[[], int]:
     return count
 
 
-def _remove(*paths: Path) -> None:
+def _remove_paths(*paths: Path) -> None:
+    """Remove files, links and whole folders, where they exist."""
     for path in paths:
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path)

@@ -70,7 +70,7 @@ def find_streams(video: Path) -> list[Stream]:
     UserError for parts of a panorama, which no lens has taken.
     """
     try:
-        command = [find_decoder().get_ffmpeg_exe(), "-hide_banner", *_ONE_FILE, "-i", _address(video)]
+        command = [find_decoder().get_ffmpeg_exe(), "-hide_banner", *_ONE_FILE, "-i", _make_absolute(video)]
         described = subprocess.run(command, capture_output=True, text=True, errors="replace").stderr
     except (OSError, RuntimeError):  # reading the frames will tell
         described = ""
@@ -178,6 +178,10 @@ def describe_videos(layout: Layout) -> list[str]:
 
 
 def _read_record(layout: Layout) -> list[dict[str, Any]]:
+    """Read frames.json: for each video its name, options and the names of its frames in `input`.
+
+    UserError if the file is damaged.
+    """
     try:
         record = read_json(layout.frames) if layout.frames.is_file() else []
         for entry in record:
@@ -197,13 +201,13 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
     decoder = find_decoder()
     try:
         sharp, small = [], []
-        told = next(decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=stream.options))
+        told = next(decoder.read_frames(_make_absolute(video), input_params=_ONE_FILE, output_params=stream.options))
         header = told | stream.header
         colours = header["pix_fmt"]
-        fields = _deinterlace_filter(colours, header.get("codec", ""))
+        fields = _list_deinterlace_filters(colours, header.get("codec", ""))
         options = [*stream.options, "-vf", ",".join([*fields, _SQUARE]), *_EVERY_FRAME]
         grey = {"pix_fmt": "gray", "bits_per_pixel": 8}
-        reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options, **grey)
+        reader = decoder.read_frames(_make_absolute(video), input_params=_ONE_FILE, output_params=options, **grey)
         width, height = next(reader)["size"]
         expected = round(header["duration"] * header["fps"]) or None
         for data in Bar(reader, total=expected, desc=f"Reading {video.name}", unit="frame"):
@@ -216,7 +220,7 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
             _warn_if_cut(decoder, video, header["duration"], stream.options)
         chosen = choose_frames(sharp, np.stack(small), count)
         hdr = next((name for tag, name in _HDR.items() if tag in colours), "")
-        filters = _sdr_filters(decoder, video, colours, bool(hdr))
+        filters = _list_sdr_filters(decoder, video, colours, bool(hdr))
         paths = [folder / f"frame_{number + 1:05d}.jpg" for number in range(len(chosen))]
         names = [path.relative_to(layout.input).as_posix() for path in paths]
         entry = {"video": video.name, "frames": len(small), "asked": count, "names": names, "hdr": hdr}
@@ -237,8 +241,8 @@ def extract_frames(layout: Layout, video: Path, folder: Path, count: int, stream
         ) from error
 
 
-def _address(video: Path) -> str:
-    """A video's name for ffmpeg, to which "12:30.mp4" is a protocol."""
+def _make_absolute(video: Path) -> str:
+    """Return the absolute path of a video: ffmpeg takes a bare "12:30.mp4" for a protocol."""
     return os.path.abspath(video)
 
 
@@ -257,7 +261,7 @@ def _warn_if_cut(decoder: Any, video: Path, duration: float, options: list[str])
         "-progress",
         "-",
     ]
-    command = [decoder.get_ffmpeg_exe(), *_ONE_FILE, "-i", _address(video), *copied]
+    command = [decoder.get_ffmpeg_exe(), *_ONE_FILE, "-i", _make_absolute(video), *copied]
     said = subprocess.run(command, capture_output=True, text=True, errors="replace").stdout
     ends = [int(number) / 1e6 for number in re.findall(r"out_time_us=(\d+)", said)]
     if ends and max(ends) < _WHOLE * duration:
@@ -311,7 +315,7 @@ def _is_different(one: np.ndarray, other: np.ndarray) -> bool:
     return float(np.sqrt(np.square(one.astype(np.float32) - other.astype(np.float32)).mean())) >= LEAST
 
 
-def _sdr_filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
+def _list_sdr_filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str]:
     """ffmpeg's filters from the colours of a stream, as its header has them, to BT.709; none if it has those already.
 
     UserError if this ffmpeg lacks the filters, or if the stream does not name its transfer function.
@@ -336,17 +340,17 @@ def _sdr_filters(decoder: Any, video: Path, colours: str, hdr: bool) -> list[str
     return [*known, _LINEAR, *([_COMPRESSED] if hdr else []), _DISPLAY]
 
 
-def _select_expression(numbers: Sequence[int]) -> str:
+def _make_select_expression(numbers: Sequence[int]) -> str:
     """ffmpeg's expression for frames of these numbers: a balanced tree, as ffmpeg 8 refuses sums of over 100 terms."""
     half = len(numbers) // 2
     return (
-        f"({_select_expression(numbers[:half])}+{_select_expression(numbers[half:])})"
+        f"({_make_select_expression(numbers[:half])}+{_make_select_expression(numbers[half:])})"
         if half
         else rf"eq(n\,{numbers[0]})"
     )
 
 
-def _deinterlace_filter(colours: str, codec: str = "") -> list[str]:
+def _list_deinterlace_filters(colours: str, codec: str = "") -> list[str]:
     """ffmpeg's filter that makes frames of the fields of an interlaced video; none of any other video."""
     found = re.search(r"\b(top|bottom) (coded )?first\b", colours)
     # A header "(tv, top coded first (swapped))" ends at its comma here.
@@ -361,9 +365,9 @@ def _read_frames(
     decoder: Any, video: Path, numbers: Sequence[int], stream: Stream, before: list[str], filters: list[str]
 ) -> Iterator[np.ndarray]:
     """Yield the frames (H, W, 3) uint8 of these numbers. before: filters that need the frames around them."""
-    chain = ",".join([*before, f"select={_select_expression(numbers)}", _SQUARE, *filters])
+    chain = ",".join([*before, f"select={_make_select_expression(numbers)}", _SQUARE, *filters])
     options = [*stream.options, "-vf", chain, *_EVERY_FRAME, "-frames:v", str(len(numbers))]
-    reader = decoder.read_frames(_address(video), input_params=_ONE_FILE, output_params=options)
+    reader = decoder.read_frames(_make_absolute(video), input_params=_ONE_FILE, output_params=options)
     width, height = next(reader)["size"]
     for data in reader:
         yield np.frombuffer(data, np.uint8).reshape(height, width, 3)

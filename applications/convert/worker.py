@@ -3,6 +3,8 @@
 In another process, steps can be stopped at once, log to a file, and do not crash the caller when they crash. The worker
 ends when its standard input closes, so it does not outlive a caller that was killed. Of the project it imports only
 modules that need no torch.
+
+A pair is two photos whose matches passed the geometric check. A survey is a file on what the mapper's models contain.
 """
 
 import contextlib
@@ -56,7 +58,7 @@ def features(job: dict[str, Any]) -> None:
         reader.camera_model = job["camera"]
         # Import the photos first, in order: threads would number them in the order in which they happen to finish. The
         # camera of a group begins with the focal length that the EXIF data of its first photo tell, if they do.
-        known = _cameras_by_name(Path(job["base"]).with_name("database.db")) if job["mapper"] == "adding" else {}
+        known = _read_cameras(Path(job["base"]).with_name("database.db")) if job["mapper"] == "adding" else {}
         longest = choose_longest_side(sum(map(len, job["groups"])))
         for names in job["groups"]:
             reader.existing_camera_id = next((known[name][0] for name in names if name in known), -1)
@@ -66,10 +68,10 @@ def features(job: dict[str, Any]) -> None:
                     reduce_photos(Path(job["images"]), Path(images), new, longest, size)
                 pycolmap.import_images(job["database"], images, pycolmap.CameraMode.SINGLE, new, reader)
     _refuse_strangers(job)
-    for octave, names in _by_octave(job["database"]).items():
+    for octave, names in _group_by_octave(job["database"]).items():
         options.sift.first_octave = octave
         pycolmap.extract_features(
-            job["database"], images, names, pycolmap.CameraMode.AUTO, reader, options, _device(job)
+            job["database"], images, names, pycolmap.CameraMode.AUTO, reader, options, _choose_device(job)
         )
 
 
@@ -85,9 +87,9 @@ def _refuse_strangers(job: dict[str, Any]) -> None:
         )
 
 
-def _by_octave(path: str) -> dict[int, list[str]]:
-    """List the photos of a database by SIFT's first octave: -1 for small photos, which SIFT enlarges twofold."""
-    database = opened(path)
+def _group_by_octave(database_path: str) -> dict[int, list[str]]:
+    """Return the photos' names by SIFT's first octave: -1 for small photos, which SIFT enlarges twofold, else 0."""
+    database = opened(database_path)
     images, sizes = database.read_all_images(), {one.camera_id: one for one in database.read_all_cameras()}
     database.close()
     longest = ABOUT * max(choose_longest_side(len(images)), ENLARGED)
@@ -98,9 +100,9 @@ def _by_octave(path: str) -> dict[int, list[str]]:
     return found
 
 
-def _cameras_by_name(path: Path) -> dict[str, tuple[int, tuple[int, int]]]:
-    """Camera and size of each photo of a database."""
-    connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+def _read_cameras(database_path: Path) -> dict[str, tuple[int, tuple[int, int]]]:
+    """Read camera id and (width, height) in pixels of each photo of a database, by the photo's name."""
+    connection = sqlite3.connect(f"{database_path.absolute().as_uri()}?mode=ro", uri=True)
     with contextlib.closing(connection):
         rows = connection.execute("SELECT name, camera_id, width, height FROM images JOIN cameras USING (camera_id)")
         return {name: (camera, (width, height)) for name, camera, width, height in rows}
@@ -108,23 +110,23 @@ def _cameras_by_name(path: Path) -> dict[str, tuple[int, tuple[int, int]]]:
 
 def matching(job: dict[str, Any]) -> None:
     """Match and verify pairs of photos; skip pairs that the database already has."""
-    path = job["database"]
-    pairing.restore_names(path)
-    _assume_focal_lengths(path)
+    database_path = job["database"]
+    pairing.restore_names(database_path)
+    _assume_focal_lengths(database_path)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = SEED
-    how = {"verification_options": verification, "device": _device(job)}
+    how = {"verification_options": verification, "device": _choose_device(job)}
     if job["matcher"] == "auto":
-        for pairs in pairing.plan_rounds(path, job["all_of"]):
-            pairing.match_pairs(path, pairs, Path(path).with_name("pairs.txt"), **how)
+        for pairs in pairing.plan_rounds(database_path, job["all_of"]):
+            pairing.match_pairs(database_path, pairs, Path(database_path).with_name("pairs.txt"), **how)
         return
     match = {"exhaustive": pycolmap.match_exhaustive, "sequential": pycolmap.match_sequential}[job["matcher"]]
-    match(path, **how)
+    match(database_path, **how)
 
 
-def _assume_focal_lengths(path: str) -> None:
+def _assume_focal_lengths(database_path: str) -> None:
     """Give fisheyes whose photos tell no focal length one to begin with: pycolmap verifies no pair without."""
-    database = opened(path)
+    database = opened(database_path)
     for camera in database.read_all_cameras():
         if camera.is_perspective_fisheye() and not camera.has_prior_focal_length:
             params = camera.params
@@ -155,25 +157,25 @@ def mapping(job: dict[str, Any]) -> None:
         if _is_dense(database):
             options.mapper.track_required_tracks_per_view = TRACKS
         options.mapper.bundle_adjustment.refine_extra_params = job["mapper"] == "global"
-        models = pycolmap.global_mapping(database, _photos(job), job["models"], options)
+        models = pycolmap.global_mapping(database, _choose_photo_folder(job), job["models"], options)
         for number, model in models.items() if job["mapper"] == "simple" else ():
             pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
             model.update_point_3d_errors()
             model.write(str(Path(job["models"], str(number))))
         return
-    options = _incremental(job)
+    options = _make_incremental_options(job)
     options.min_model_size = 3  # a small model is better than none; the report shows its size
-    pycolmap.incremental_mapping(database, _photos(job), job["models"], options)
+    pycolmap.incremental_mapping(database, _choose_photo_folder(job), job["models"], options)
 
 
-def _photos(job: dict[str, Any]) -> str:
+def _choose_photo_folder(job: dict[str, Any]) -> str:
     """The folder of the photos in which features were found, from which points take their colours."""
     return job["small"] if Path(job["small"]).is_dir() else job["images"]
 
 
-def _is_dense(path: str) -> bool:
-    """Tell if there are many photos with many matches, of which some are enough."""
-    database = opened(path)
+def _is_dense(database_path: str) -> bool:
+    """Tell if a database has many photos with so many matches that a part of the matches is enough for mapping."""
+    database = opened(database_path)
     count, matches = database.num_images(), database.num_inlier_matches()
     database.close()
     return count > FEW and matches > DENSE * count
@@ -187,7 +189,8 @@ def keep(job: dict[str, Any]) -> None:
     model.write(job["model"])
 
 
-def _incremental(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
+def _make_incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
+    """Make options of incremental mapping with the tolerance of the job and a fixed seed."""
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed, options.num_threads = SEED, THREADS
     options.ba_global_function_tolerance = job["tolerance"]
@@ -196,11 +199,11 @@ def _incremental(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:
 
 def adding(job: dict[str, Any]) -> None:
     """Place further photos beside those of the model `base`, whose poses and lenses stay as they are."""
-    folder, options = Path(job["models"], "0"), _incremental(job)
+    folder, options = Path(job["models"], "0"), _make_incremental_options(job)
     folder.mkdir(parents=True)
     options.multiple_models, options.fix_existing_frames = False, True
     options.constant_cameras = set(pycolmap.Reconstruction(job["base"]).cameras)
-    pycolmap.incremental_mapping(job["database"], _photos(job), str(folder), options, job["base"])
+    pycolmap.incremental_mapping(job["database"], _choose_photo_folder(job), str(folder), options, job["base"])
 
 
 def triangulation(job: dict[str, Any]) -> None:
@@ -210,11 +213,11 @@ def triangulation(job: dict[str, Any]) -> None:
     options = pycolmap.IncrementalPipelineOptions()
     options.random_seed, options.num_threads = SEED, THREADS
     pycolmap.triangulate_points(
-        _given(job["given"]), job["database"], job["images"], str(folder), True, options, refine_intrinsics=False
+        _read_given(job["given"]), job["database"], job["images"], str(folder), True, options, refine_intrinsics=False
     )
 
 
-def _given(path: str) -> pycolmap.Reconstruction:
+def _read_given(path: str) -> pycolmap.Reconstruction:
     """The cameras and photos of given.json as a model without points, with ids in the order of the file."""
     content, model = json.loads(Path(path).read_text(encoding="utf-8")), pycolmap.Reconstruction()
     for number, entry in enumerate(content["cameras"], start=1):
@@ -231,7 +234,7 @@ def _given(path: str) -> pycolmap.Reconstruction:
 
 def _enter_given(job: dict[str, Any]) -> None:
     """Write the cameras and photos of given.json into the database, with the same ids."""
-    model, database = _given(job["given"]), opened(job["database"])
+    model, database = _read_given(job["given"]), opened(job["database"])
     for number, camera in model.cameras.items():
         database.write_camera(camera, use_camera_id=True)
         database.write_rig(model.rigs[number], use_rig_id=True)
@@ -248,7 +251,7 @@ def judging(job: dict[str, Any]) -> None:
     """
     found = [
         {"folder": folder, "photos": model.num_reg_images()} | judge(model, job["calibrated"])
-        for folder, model in _models(job["models"])[:_JUDGED]
+        for folder, model in _read_models(job["models"])[:_JUDGED]
     ]
     best = max(found, key=lambda one: (one["agreeing"], one["photos"]), default={})
     Path(job["out"]).write_text(json.dumps(best), encoding="utf-8")
@@ -263,14 +266,14 @@ def survey(job: dict[str, Any]) -> None:
             "points": model.num_points3D(),
             "track_length": model.compute_mean_track_length(),
             "error": model.compute_mean_reprojection_error(),
-            "cameras": [_camera(model, camera) for _, camera in sorted(model.cameras.items())],
+            "cameras": [_describe_camera(model, camera) for _, camera in sorted(model.cameras.items())],
         }
-        for folder, model in _models(job["models"], Path(job["images"]))
+        for folder, model in _read_models(job["models"], Path(job["images"]))
     ]
     Path(job["out"]).write_text(json.dumps(models), encoding="utf-8")
 
 
-def _models(path: str, photos: Path | None = None) -> list[tuple[str, pycolmap.Reconstruction]]:
+def _read_models(path: str, photos: Path | None = None) -> list[tuple[str, pycolmap.Reconstruction]]:
     """The models in the sub-folders of a folder, by name, the one with the most photos first.
 
     photos: folder of the photos to whose size they are brought; None: they stay as they are.
@@ -285,22 +288,27 @@ def _models(path: str, photos: Path | None = None) -> list[tuple[str, pycolmap.R
     return sorted(found, key=lambda one: (-one[1].num_reg_images(), -one[1].num_points3D(), one[0]))
 
 
-def _camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> dict[str, Any]:
-    """Describe a camera of a model. photos: by name, what `_refit` finds."""
+def _describe_camera(model: pycolmap.Reconstruction, camera: pycolmap.Camera) -> dict[str, Any]:
+    """Describe a camera of a model: id, lens model, size in pixels, params, and its photos.
+
+    photos: by name, the result of `_probe_focal_length`.
+    """
     images = [model.images[i] for i in model.reg_image_ids() if model.images[i].camera_id == camera.camera_id]
     return {
         "id": camera.camera_id,
         "model": camera.model_name,
         "size": [camera.width, camera.height],
         "params": camera.params.tolist(),
-        "photos": {image.name: _refit(model, image) for image in sorted(images, key=lambda one: one.name)},
+        "photos": {image.name: _probe_focal_length(model, image) for image in sorted(images, key=lambda one: one.name)},
     }
 
 
-def _refit(model: pycolmap.Reconstruction, image: pycolmap.Image) -> list[float]:
-    """Fit pose and focal length of one photo to its points, which stay where they are.
+def _probe_focal_length(model: pycolmap.Reconstruction, image: pycolmap.Image) -> list[float]:
+    """Fit focal length and pose of a single photo to its points, to see if it came through another lens.
 
-    Return the factor of the focal length, and the median error (pixels) before and after; nothing if it has few points.
+    The model stays as it is: the fit works on copies. A photo of another lens than that of its camera fits much better.
+    Return the fitted focal length divided by the model's, and the median error in pixels before and after the fit; []
+    if too few points tell the focal length.
     """
     numbers, camera = image.get_observation_point2D_idxs(), pycolmap.Camera(image.camera.todict())
     if len(numbers) < FEWEST_SEEN or not camera.focal_length_idxs():
@@ -366,11 +374,13 @@ def undistort(job: dict[str, Any]) -> None:
         pycolmap.undistort_images(job["out"], folder, job["images"], jpeg_quality=job["jpeg_quality"])
 
 
-def _device(job: dict[str, Any]) -> pycolmap.Device:
+def _choose_device(job: dict[str, Any]) -> pycolmap.Device:
+    """Choose the CPU if the job forbids the GPU, else whatever pycolmap finds."""
     return pycolmap.Device.cpu if job["no_gpu"] else pycolmap.Device.auto
 
 
 def _end_with_input() -> None:
+    """End this process when its standard input closes, as it does once the caller has ended."""
     # Do not read sys.stdin: its lock would be held when the interpreter shuts down.
     while os.read(0, 1024):
         pass

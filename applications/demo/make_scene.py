@@ -33,20 +33,22 @@ MIN_TRACK = 3  # least number of views that see a point
 Things = Callable[[int | None], list[Thing]]  # that stand in a photo, by its number; None: those that stay
 
 
-def _demo(_: int | None) -> list[Thing]:
+def _make_demo_things(_: int | None) -> list[Thing]:
+    """Return the things of the demo scene, which are the same in every view."""
     return demo_scene()
 
 
-def _image(things: Things, samples: int, number: int, view: View) -> np.ndarray:
+def _render_image(things: Things, samples: int, number: int, view: View) -> np.ndarray:
+    """Ray-trace one view to a photo (H, W, 3) uint8. number: of the view, as a scene may move."""
     return render_view(things(number), view, samples)
 
 
-def _images(views: list[View], things: Things, samples: int) -> list[np.ndarray]:
+def _render_images(views: list[View], things: Things, samples: int) -> list[np.ndarray]:
     """Ray-trace the views to photos, (H, W, 3) uint8 each, on several cores if that saves time."""
     pixels = sum(view.width * view.height for view in views)
     workers = min(cores(), 1 + pixels // PIXELS_PER_PROCESS)
     bar = partial(Bar, total=len(views), desc="Ray tracing", unit="view")
-    image, numbers = partial(_image, things, samples), range(len(views))
+    image, numbers = partial(_render_image, things, samples), range(len(views))
     if workers == 1:
         return list(bar(map(image, numbers, views)))
     # Use processes, because numpy holds the interpreter's lock most of the time on blocks this small.
@@ -64,7 +66,7 @@ class SurfacePoints:
     keypoints: list[np.ndarray]  # for each view, their observed positions (K, 2) in pixels; pixel centres are at .5
 
 
-def _found_by_views(
+def _sample_surface(
     things: list[Thing], views: list[View], count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return surface points (3, N) under `count` random pixels of random views, and their distances (N,)."""
@@ -82,7 +84,7 @@ def _found_by_views(
     return points[:, hits], distance[hits]
 
 
-def _visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_visible(things: list[Thing], view: View, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices (K,) of the surface points (3, N) that a view sees, and their image positions (K, 2)."""
     x, y, z = view.project(points)
     inside = np.flatnonzero((z > 0) & (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height))
@@ -103,9 +105,9 @@ def sample_points(
     images: the views' photos, (H, W, 3) uint8. A point's colour is its mean over the photos that see it, so it does
     not depend on the view.
     """
-    points, distance = _found_by_views(things, views, count, rng)
+    points, distance = _sample_surface(things, views, count, rng)
     count = len(distance)
-    seen, exact = zip(*(_visible(things, view, points) for view in views), strict=True)
+    seen, exact = zip(*(_find_visible(things, view, points) for view in views), strict=True)
     track = np.bincount(np.concatenate(seen), minlength=count)
     colour = np.zeros((count, 3))
     for index, place, image in zip(seen, exact, images, strict=True):
@@ -154,7 +156,7 @@ def write_scene(
     things: a function that another process can import. samples: of `render_view`. UserError if there are no points.
     """
     (out / "images").mkdir(parents=True)
-    images, names = _images(views, things, samples), [f"view_{k:03d}.png" for k in range(len(views))]
+    images, names = _render_images(views, things, samples), [f"view_{k:03d}.png" for k in range(len(views))]
     for name, image in zip(names, images, strict=True):
         Image.fromarray(image).save(out / "images" / name)
     cloud = sample_points(things(None), views, images, points, rng)
@@ -172,7 +174,7 @@ def make_scene(
     points: int,
     seed: int,
     camera: str = "pinhole",
-    things: Things = _demo,
+    things: Things = _make_demo_things,
 ) -> int:
     """Write the scene to `out` (images/, sparse/0) and return its number of points.
 
@@ -207,6 +209,7 @@ def make_scene(
 
 
 def main() -> None:
+    """Make the scene that the command line asks for."""
     parser = ArgumentParser(
         prog="python -m applications.demo.make_scene", description="Make the ray-traced demo scene."
     )

@@ -31,7 +31,7 @@ def normalize(v: np.ndarray) -> np.ndarray:
     return v / np.sqrt(dot(v, v))
 
 
-def _column(*values: float) -> np.ndarray:
+def _make_column(*values: float) -> np.ndarray:
     return np.asarray(values, np.float32).reshape(3, 1)
 
 
@@ -42,6 +42,7 @@ class Ground:
     radius: float
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the distance (R,) along each ray to the ground."""
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -origin[1] / direction[1]
             x = origin[0] + t * direction[0]
@@ -50,7 +51,7 @@ class Ground:
         return np.where(hit, t, np.float32(np.inf))
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(_column(0, -1, 0), points.shape)
+        return np.broadcast_to(_make_column(0, -1, 0), points.shape)
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,8 @@ class Sphere:
     inside: bool = False
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        oc = origin - _column(*self.center)
+        """Return the distance (R,) along each ray to the sphere, also from inside."""
+        oc = origin - _make_column(*self.center)
         b = dot(oc, direction)
         discriminant = b * b - (dot(oc, oc) - np.float32(self.radius**2))
         with np.errstate(invalid="ignore"):
@@ -72,7 +74,7 @@ class Sphere:
             return np.where(t > NEAR, t, np.float32(np.inf))
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        n = (points - _column(*self.center)) / np.float32(self.radius)
+        n = (points - _make_column(*self.center)) / np.float32(self.radius)
         return -n if self.inside else n
 
 
@@ -85,20 +87,21 @@ class Torus:
     radius: float
     tube: float
 
-    def _local(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _locate_points(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return offset from the centre (3, R), height over the torus' plane (R,) and distance from its axis (R,)."""
-        offset = points - _column(*self.center)
-        height = dot(offset, normalize(_column(*self.axis)))
+        offset = points - _make_column(*self.center)
+        height = dot(offset, normalize(_make_column(*self.axis)))
         return offset, height, np.sqrt(np.maximum(dot(offset, offset) - height * height, np.float32(1e-12)))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Return signed distances (R,) of points (3, R) from the surface."""
-        _, height, ring = self._local(points)
+        _, height, ring = self._locate_points(points)
         return np.hypot(ring - np.float32(self.radius), height) - np.float32(self.tube)
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        """Return the distance (R,) along each ray to the torus, in steps that the distance to its surface allows."""
         bound = self.radius + self.tube
-        oc = origin - _column(*self.center)
+        oc = origin - _make_column(*self.center)
         b = dot(oc, direction)
         discriminant = b * b - (dot(oc, oc) - np.float32(bound**2))
         result = np.full(b.shape, np.inf, np.float32)
@@ -119,8 +122,8 @@ class Torus:
         return result
 
     def normal(self, points: np.ndarray) -> np.ndarray:
-        offset, height, ring = self._local(points)
-        axis = normalize(_column(*self.axis))
+        offset, height, ring = self._locate_points(points)
+        axis = normalize(_make_column(*self.axis))
         ring_point = (offset - height * axis) * (np.float32(self.radius) / ring)
         return normalize(offset - ring_point)
 
@@ -133,19 +136,20 @@ class Box:
     half: tuple[float, float, float]
     turn: float
 
-    def _turned(self, v: np.ndarray, sign: int = 1) -> np.ndarray:
+    def _turn_vectors(self, v: np.ndarray, sign: int = 1) -> np.ndarray:
         """Vectors (3, R) in the box's own frame; with the sign -1 back to the world's."""
         c, s = np.float32(np.cos(self.turn)), np.float32(sign * np.sin(self.turn))
         return np.stack([c * v[0] - s * v[2], v[1], s * v[0] + c * v[2]])
 
     def local(self, points: np.ndarray) -> np.ndarray:
         """Return points (3, R) in the box's own frame, in units of its half sizes: the surface is at max |.| = 1."""
-        return self._turned(points - _column(*self.center)) / _column(*self.half)
+        return self._turn_vectors(points - _make_column(*self.center)) / _make_column(*self.half)
 
     def intersect(self, origin: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        o = self._turned(origin - _column(*self.center))
-        d = self._turned(direction)
-        half = _column(*self.half)
+        """Return the distance (R,) along each ray to the box, also from inside."""
+        o = self._turn_vectors(origin - _make_column(*self.center))
+        d = self._turn_vectors(direction)
+        half = _make_column(*self.half)
         with np.errstate(divide="ignore", invalid="ignore"):
             middle, reach = -o / d, np.abs(half / d)
             enter = (middle - reach).max(axis=0)
@@ -154,12 +158,13 @@ class Box:
             return np.where((leave >= enter) & (t > NEAR), t, np.float32(np.inf))
 
     def normal(self, points: np.ndarray) -> np.ndarray:
+        """Return the unit normals (3, R) of the faces on which points (3, R) of the surface lie."""
         q = self.local(points)
         face = np.argmax(np.abs(q), axis=0)
         index = np.arange(q.shape[1])
         n = np.zeros_like(q)
         n[face, index] = np.sign(q[face, index])
-        return self._turned(n, -1)
+        return self._turn_vectors(n, -1)
 
 
 Shape = Ground | Sphere | Torus | Box
@@ -181,13 +186,13 @@ def _mix(a: np.ndarray, b: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return a + (b - a) * weight
 
 
-def _edge(x: np.ndarray, softness: float) -> np.ndarray:
+def _soften_edge(x: np.ndarray, softness: float) -> np.ndarray:
     """Return a step at zero, softened over +-softness."""
     s = np.clip(x / np.float32(2 * softness) + np.float32(0.5), 0, 1)
     return s * s * (3 - 2 * s)
 
 
-def _waves(p: np.ndarray, frequency: float, seed: int, count: int = 6) -> np.ndarray:
+def _make_waves(p: np.ndarray, frequency: float, seed: int, count: int = 6) -> np.ndarray:
     """Return smooth band-limited noise (R,) in [-1, 1], the mean of plane waves of random direction and phase."""
     rng = np.random.default_rng(seed)
     total = np.zeros(p.shape[1], np.float32)
@@ -201,25 +206,25 @@ def _waves(p: np.ndarray, frequency: float, seed: int, count: int = 6) -> np.nda
 def ground_texture(p: np.ndarray) -> np.ndarray:
     """Return mottled two-tone tiles with soft seams, which fade to plain sand away from the middle."""
     tile = np.float32(np.pi / 0.55)
-    check = _edge(np.sin(tile * p[0]) * np.sin(tile * p[2]), 0.25)
-    colour = _mix(_column(0.72, 0.63, 0.50), _column(0.34, 0.42, 0.46), check)
-    colour = _mix(_column(0.62, 0.58, 0.50), colour, _edge(np.float32(2.6) - np.hypot(p[0], p[2]), 0.5))
-    return colour * (1 + np.float32(0.45) * _waves(p, 5.0, 1) + np.float32(0.25) * _waves(p, 17.0, 2))
+    check = _soften_edge(np.sin(tile * p[0]) * np.sin(tile * p[2]), 0.25)
+    colour = _mix(_make_column(0.72, 0.63, 0.50), _make_column(0.34, 0.42, 0.46), check)
+    colour = _mix(_make_column(0.62, 0.58, 0.50), colour, _soften_edge(np.float32(2.6) - np.hypot(p[0], p[2]), 0.5))
+    return colour * (1 + np.float32(0.45) * _make_waves(p, 5.0, 1) + np.float32(0.25) * _make_waves(p, 17.0, 2))
 
 
 def backdrop_texture(p: np.ndarray) -> np.ndarray:
     """Return a sky from haze to blue with broad soft clouds."""
     up = np.clip(-p[1] / np.float32(9), 0, 1)
-    colour = _mix(_column(0.86, 0.84, 0.80), _column(0.36, 0.54, 0.80), np.sqrt(up))
-    return _mix(colour, _column(0.95, 0.95, 0.96), _edge(_waves(p, 0.9, 3), 0.5) * np.float32(0.6))
+    colour = _mix(_make_column(0.86, 0.84, 0.80), _make_column(0.36, 0.54, 0.80), np.sqrt(up))
+    return _mix(colour, _make_column(0.95, 0.95, 0.96), _soften_edge(_make_waves(p, 0.9, 3), 0.5) * np.float32(0.6))
 
 
 def stripes(axis: int, frequency: float, light: np.ndarray, dark: np.ndarray) -> Texture:
     """Make a texture of soft, slightly wavy stripes along a world axis."""
 
     def texture(p: np.ndarray) -> np.ndarray:
-        phase = np.float32(frequency) * p[axis] + np.float32(0.8) * _waves(p, 6.0, 4)
-        return _mix(light, dark, _edge(np.sin(phase), 0.35))
+        phase = np.float32(frequency) * p[axis] + np.float32(0.8) * _make_waves(p, 6.0, 4)
+        return _mix(light, dark, _soften_edge(np.sin(phase), 0.35))
 
     return texture
 
@@ -228,8 +233,8 @@ def marble(light: np.ndarray, dark: np.ndarray, seed: int) -> Texture:
     """Make a texture with veins of one colour in another."""
 
     def texture(p: np.ndarray) -> np.ndarray:
-        vein = np.abs(_waves(p, 7.0, seed) + np.float32(0.4) * _waves(p, 19.0, seed + 1))
-        return _mix(dark, light, _edge(vein - np.float32(0.12), 0.12))
+        vein = np.abs(_make_waves(p, 7.0, seed) + np.float32(0.4) * _make_waves(p, 19.0, seed + 1))
+        return _mix(dark, light, _soften_edge(vein - np.float32(0.12), 0.12))
 
     return texture
 
@@ -239,9 +244,11 @@ def panels(box: Box) -> Texture:
 
     def texture(p: np.ndarray) -> np.ndarray:
         q = np.sort(np.abs(box.local(p)), axis=0)
-        frame = _edge(q[1] - np.float32(0.78), 0.08)
-        filling = _mix(_column(0.75, 0.32, 0.20), _column(0.90, 0.66, 0.30), _edge(_waves(p, 12.0, 5), 0.4))
-        return _mix(filling, _column(0.22, 0.16, 0.14), frame)
+        frame = _soften_edge(q[1] - np.float32(0.78), 0.08)
+        filling = _mix(
+            _make_column(0.75, 0.32, 0.20), _make_column(0.90, 0.66, 0.30), _soften_edge(_make_waves(p, 12.0, 5), 0.4)
+        )
+        return _mix(filling, _make_column(0.22, 0.16, 0.14), frame)
 
     return texture
 
@@ -254,9 +261,9 @@ def ring_stripes(torus: Torus, count: int, light: np.ndarray, dark: np.ndarray) 
     second = np.cross(axis, first)
 
     def texture(p: np.ndarray) -> np.ndarray:
-        offset = p - _column(*torus.center)
+        offset = p - _make_column(*torus.center)
         angle = np.arctan2(second.astype(np.float32) @ offset, first.astype(np.float32) @ offset)
-        return _mix(light, dark, _edge(np.sin(np.float32(count) * angle), 0.3))
+        return _mix(light, dark, _soften_edge(np.sin(np.float32(count) * angle), 0.3))
 
     return texture
 
@@ -273,19 +280,24 @@ def demo_scene() -> list[Thing]:
         Thing(Ground(9.0), ground_texture),
         Thing(
             Sphere((-0.95, -0.55, -0.15), 0.55),
-            stripes(1, 14.0, _column(0.80, 0.20, 0.16), _column(0.92, 0.82, 0.66)),
+            stripes(1, 14.0, _make_column(0.80, 0.20, 0.16), _make_column(0.92, 0.82, 0.66)),
             mirror=0.05,
             highlight=0.5,
             exponent=50,
         ),
         Thing(
             Sphere((0.30, -0.42, -0.75), 0.42),
-            marble(_column(0.16, 0.45, 0.52), _column(0.80, 0.88, 0.85), 6),
+            marble(_make_column(0.16, 0.45, 0.52), _make_column(0.80, 0.88, 0.85), 6),
             mirror=0.16,
             highlight=0.35,
             exponent=25,
         ),
-        Thing(Sphere((1.25, -0.24, -0.55), 0.24), marble(_column(0.42, 0.55, 0.22), _column(0.75, 0.80, 0.40), 8)),
-        Thing(torus, ring_stripes(torus, 9, _column(0.93, 0.78, 0.28), _column(0.25, 0.22, 0.42)), highlight=0.4),
+        Thing(
+            Sphere((1.25, -0.24, -0.55), 0.24),
+            marble(_make_column(0.42, 0.55, 0.22), _make_column(0.75, 0.80, 0.40), 8),
+        ),
+        Thing(
+            torus, ring_stripes(torus, 9, _make_column(0.93, 0.78, 0.28), _make_column(0.25, 0.22, 0.42)), highlight=0.4
+        ),
         Thing(box, panels(box)),
     ]

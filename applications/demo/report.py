@@ -18,11 +18,12 @@ from splatting.records.renders import contact_sheet, image_of
 from utils.system_utils import UserError, atomic_write, run_cli, searchForMaxIteration
 
 
-def _shown(value: float | None, digits: int, unit: str = "") -> str:
+def _format_value(value: float | None, digits: int, unit: str = "") -> str:
     return "-" if value is None else f"{value:.{digits}f}{unit}"
 
 
 def main() -> None:
+    """Print the table of a model, and write its contact sheet."""
     parser = ArgumentParser(
         prog="python -m applications.demo.report", description="Table and contact sheet of a trained model."
     )
@@ -41,7 +42,7 @@ def main() -> None:
     rows = []
     for name in picked:
         images = [image_of(model / "test" / method / side / name) for side in ("gt", "renders")]
-        rows.append((f"test view {Path(name).stem}: {_shown(per_view['PSNR'][name], 2, ' dB')}", *images))
+        rows.append((f"test view {Path(name).stem}: {_format_value(per_view['PSNR'][name], 2, ' dB')}", *images))
     count = count_gaussians(model, iteration)
     sheet = model / "contact_sheet.png"
     with atomic_write(sheet) as temporary:
@@ -50,11 +51,11 @@ def main() -> None:
     table = [
         ("scene", Path(str(read_cfg_args(model).get("source_path", "-"))).name),
         ("iterations", str(iteration)),
-        ("training", _shown(training_seconds(model, iteration), 0, " s")),
+        ("training", _format_value(training_seconds(model, iteration), 0, " s")),
         ("Gaussians", str(count)),
         ("test views", str(len(names))),
-        ("PSNR", _shown(means["PSNR"], 2, " dB")),
-        ("SSIM", _shown(means["SSIM"], 4)),
+        ("PSNR", _format_value(means["PSNR"], 2, " dB")),
+        ("SSIM", _format_value(means["SSIM"], 4)),
     ]
     widths = [max(len(cell) for cell in column) for column in table]
     for line in zip(*table, strict=True):

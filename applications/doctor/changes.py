@@ -58,13 +58,13 @@ def check_strange_photos(scene: Scene, scored: ScoredViews) -> Finding | None:
     views = views[:: -(-len(views) // MOST_PHOTOS) or 1]
     images = [scored.image(view, scene.gaussians) for view in views]
     photos = [as_float(scored.target(view)) for view in views]
-    own = [_psnr(*pair) for pair in zip(images, photos, strict=True)]
+    own = [_measure_psnr(*pair) for pair in zip(images, photos, strict=True)]
     found = []
     for place in sorted(range(len(views)), key=own.__getitem__)[:_SUSPECTS]:
-        row = [_psnr(images[place], photo) for photo in photos]
+        row = [_measure_psnr(images[place], photo) for photo in photos]
         if max(row) < max(FITS, own[place] + CLEARLY):
             continue
-        if max(_psnr(image, photos[place]) for image in images) >= own[place] + CLEARLY:
+        if max(_measure_psnr(image, photos[place]) for image in images) >= own[place] + CLEARLY:
             found.append(views[place].image_name)
     if not found:
         return None
@@ -73,5 +73,5 @@ def check_strange_photos(scene: Scene, scored: ScoredViews) -> Finding | None:
     return Finding(text, "restore the photos that these cameras were computed from, under their names")
 
 
-def _psnr(image: Tensor, photo: Tensor) -> float:
+def _measure_psnr(image: Tensor, photo: Tensor) -> float:
     return float(psnr(image, photo).mean())

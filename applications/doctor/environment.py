@@ -48,17 +48,19 @@ def can_load_extensions() -> bool:
     try:
         importlib.import_module("groundwork.host.extensions")
         for name in EXTENSIONS:
-            importlib.import_module(_package(name))
+            importlib.import_module(_name_package(name))
     except ImportError:
         return False
     return True
 
 
-def _package(extension: str) -> str:
+def _name_package(extension: str) -> str:
+    """Return the name under which Python imports an extension."""
     return extension.replace("-", "_")
 
 
 def _list_required() -> list[str]:
+    """List the packages that requirements.txt pins, without those that this machine cannot have."""
     text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
     names = dict.fromkeys(re.findall(r"^([A-Za-z0-9_-]+)==", text, re.MULTILINE))
     if sys.platform == "linux" and platform.machine() != "x86_64":
@@ -74,6 +76,7 @@ def _read_version(name: str) -> str | None:
 
 
 def _check_gpu(torch) -> Finding:
+    """Check that torch can use the NVIDIA GPU, if there is one. torch: the imported package."""
     if torch.cuda.is_available():
         from groundwork.host.machine import OLDEST_GPU
 
@@ -104,7 +107,8 @@ def _find_nvidia_gpu() -> str:
 
 
 def _check_extension(name: str) -> Finding:
-    package = _package(name)
+    """Check that an extension is installed, loads, and was built from the sources of this repository."""
+    package = _name_package(name)
     extension, again = f"the extension {name}", f"run `pip install ./submodules/{name}`"
     installed = _read_version(name) or _read_version(WHOLE)
     if installed is None:

@@ -84,7 +84,7 @@ def run_child(command: Sequence[str], say: str = "", slot: Slot | None = None, *
             if not reader.is_alive():
                 child.stderr.close()
         requested, status = interrupt.requested, child.returncode
-    lines = _last_lines(tail)
+    lines = _list_last_lines(tail)
     if status < 0:
         lines.append(f"killed by {signal.Signals(-status).name}")
     return Finished(status, lines or [f"exit status {status}"], time.perf_counter() - start, cpu, requested)
@@ -138,7 +138,7 @@ def _wait_for(child: subprocess.Popen) -> float | None:
     return usage.ru_utime + usage.ru_stime
 
 
-def _last_lines(tail: bytearray) -> list[str]:
+def _list_last_lines(tail: bytearray) -> list[str]:
     """The last lines, without progress bars, which redraw their line with carriage returns."""
     lines = (line.rsplit("\r", 1)[-1] for line in tail.decode("utf-8", "replace").split("\n"))
     return [line.rstrip() for line in lines if line.strip() and not re.search(r"\d+%\|", line)][-LINES:]

@@ -50,6 +50,7 @@ _SHORT_FOR = {  # flags: words for train.py that they stand for, and help
 
 
 def _make_parser() -> OptionParser:
+    """Make the parser of the command line."""
     parser = OptionParser(
         description=__doc__.splitlines()[0],
         epilog="Options after -- go to train.py. A training counts as finished if it used the same scene folder and "
@@ -96,6 +97,7 @@ def _make_parser() -> OptionParser:
 
 
 def _list_scenes(args: Namespace) -> list[SceneEntry]:
+    """List the scenes of the data sets and folders that the options name. UserError for unusable ones."""
     groups = ("mipnerf360", "tanksandtemples", "deepblending")
     roots = [(group, root) for group in groups if (root := getattr(args, group))]
     scenes = [entry for group, root in roots for entry in plan.dataset_scenes(group, root, args.resize)]
@@ -146,6 +148,7 @@ def _plan_all(args: Namespace, more: Sequence[str]) -> list[Run]:
 
 
 def _parse_for_training(words: Sequence[str]) -> tuple[Namespace, ...]:
+    """Return train.py's groups of options, parsed from the words of a command line."""
     from splatting.commands import (
         train,  # imported here because scoring existing models may happen on a machine without the extensions
     )
@@ -176,6 +179,11 @@ def _carry_out(
     download = True
 
     def carry_out(numbered: tuple[int, Run], slot: Slot | None = None) -> None:
+        """Train, render and score one run, and print how it ended.
+
+        numbered: its number from 1 on, and the run.
+        slot: the GPU to use; None: the first one.
+        """
         nonlocal download
         number, run = numbered
         begun, child = time.perf_counter(), partial(start, slot=slot)

@@ -69,7 +69,7 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """
     rows = []
     for (scene, config), members in group_by(runs, "scene", "config").items():
-        for at in _list_moments([run for run in members if not run["failure"]]):
+        for at in _group_scored_runs([run for run in members if not run["failure"]]):
             there = [run for run, _ in at]
             row = {name: summarise_spread(run["iterations"][str(t)].get(name) for run, t in at) for name in QUANTITIES}
             iterations = sorted({t for _, t in at})
@@ -93,10 +93,11 @@ def summarise(runs: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def _list_moments(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], int]]]:
-    """Return for each row of an option set its runs, each with a scored iteration.
+def _group_scored_runs(runs: Sequence[dict[str, Any]]) -> list[list[tuple[dict[str, Any], int]]]:
+    """Group the runs of an option set, one for each seed, into the rows of a table: (run, scored iteration) each.
 
-    The iteration is the same for all runs of a row, but the last one of runs that ended by themselves.
+    Runs as long as --iterations says give a row for each iteration at which any of them was scored. Runs that end by
+    themselves, each after another number of iterations, give the last row, of their final iterations.
     """
     fixed = [run for run in runs if not run["open_ended"]]
     scored = {int(n) for run in fixed for n, values in run["iterations"].items() if values["views"]}
@@ -239,6 +240,10 @@ def compare(
 
 
 def _meets_requirements(run: dict[str, Any], required: dict[str, Any]) -> bool:
+    """Tell if a run has the test views, their sizes and the options that a published table was made with.
+
+    required: `test_sizes`, `test_views` and `options`, each of which may be missing.
+    """
     return (
         run["test_sizes"] == required.get("test_sizes", run["test_sizes"])
         and run["views"]["test"] == required.get("test_views", run["views"]["test"])

@@ -37,7 +37,7 @@ SAME = 1.02  # times as many Gaussians, or fewer, are the same number
 LEGEND = 72  # letters in a line of a legend
 
 
-def _panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Callable[[Axes], str | None]) -> Path:
+def _draw_panel(path: Path, title: str, log: bool, labels: tuple[str, str], draw: Callable[[Axes], str | None]) -> Path:
     """Write a figure of one panel, whose legend lies below it.
 
     log: true if the y axis is logarithmic.
@@ -76,7 +76,7 @@ def draw_curves(
     subset = common_subset(run["curve"] for run in runs if not run["apart"])
     said = describe_views(subset, counts.pop() if len(counts) == 1 else None)
     said += "" if subset is None else f"; hollow{' and other programs' if peers else ''}: all of them"
-    said += _about_seeds(runs, subset)
+    said += _describe_seeds(runs, subset)
 
     def draw(axes: Axes, value: Value) -> str:
         _draw_runs(axes, runs, value, several, subset)
@@ -86,12 +86,12 @@ def draw_curves(
     x = SECONDS + (" (other programs: as they count)" if peers else "")
     panels = {"psnr": (psnr, "PSNR of the test views (dB)"), "ssim": (dissimilarity, "1 - SSIM of the test views")}
     return [
-        _panel(folder / f"{scene}_{name}.png", scene, name != "psnr", (x, y), partial(draw, value=value))
+        _draw_panel(folder / f"{scene}_{name}.png", scene, name != "psnr", (x, y), partial(draw, value=value))
         for name, (value, y) in (panels.items() if runs else ())
     ]
 
 
-def _about_seeds(runs: Sequence[dict[str, Any]], subset: int | None) -> str:
+def _describe_seeds(runs: Sequence[dict[str, Any]], subset: int | None) -> str:
     """Say how the seeds of option sets are drawn; empty without several."""
     curves: dict[str, list[Sequence[Row]]] = {}
     for run in runs:
@@ -126,7 +126,7 @@ def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
     labels = "thousands of Gaussians", "PSNR of the test views (dB)"
     counts = [count for points in lines.values() for count, _ in points]
     several = lines and len({run["config"] for run in runs}) > 1 and max(counts) > SAME * min(counts)
-    return [_panel(folder / f"{scene}_size.png", scene, False, labels, draw)] if several else []
+    return [_draw_panel(folder / f"{scene}_size.png", scene, False, labels, draw)] if several else []
 
 
 def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
@@ -135,6 +135,7 @@ def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
     configs = list(dict.fromkeys(run["config"] for run in shown))
 
     def draw(axes: Axes) -> None:
+        """Draw a line for each run, with the name of its option set once."""
         for place, run in enumerate(shown):
             again = any(run["config"] == other["config"] for other in shown[:place])
             style = {"color": f"C{configs.index(run['config']) % 10}", "marker": "o", "markersize": 3.5}
@@ -142,7 +143,7 @@ def draw_poses(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list
             draw_line(axes, points, None if again else run["config"] or "training views", **style)
 
     labels = SECONDS, "mean turn of the training views (degrees)"
-    return [_panel(folder / f"{scene}_poses.png", scene, False, labels, draw)] if shown else []
+    return [_draw_panel(folder / f"{scene}_poses.png", scene, False, labels, draw)] if shown else []
 
 
 def draw_cameras(folder: Path, scene: str, splits: Mapping[str, Sequence[Any]]) -> list[Path]:

@@ -2,6 +2,7 @@
 
 Runs of one seed share photos, order and start, so their difference varies less than each score does (common random
 numbers). Intervals are Student's t at 95 %; p values of several scenes are corrected by Holm's procedure (1979).
+A verdict says in words whether an option set gains, costs, makes no difference above some dB, or is not decided.
 """
 
 from __future__ import annotations
@@ -37,19 +38,23 @@ def compute_gains(runs: Sequence[Run]) -> dict[str, Any]:
 
 
 def _pair_seeds(sets: Sets) -> dict[str, dict[str, Any]]:
+    """Return, for each option set but the default, the interval of its gain in test PSNR (dB) over common seeds.
+
+    sets: runs by option set; a set needs two seeds that the default set has, too.
+    """
     default = choose_default_set(sets)
-    theirs = _final_psnr(sets[default])
+    theirs = _read_final_psnr(sets[default])
     rows = {}
     for name, runs in sets.items():
-        own = _final_psnr(runs)
+        own = _read_final_psnr(runs)
         seeds = [seed for seed in own if seed in theirs]
         if name != default and len(seeds) > 1:
             rows[name] = {"seeds": len(seeds)} | compute_interval([own[seed] - theirs[seed] for seed in seeds])
     return rows
 
 
-def _final_psnr(runs: Sequence[Run]) -> dict[Any, float]:
-    """The test PSNR at the end, by seed."""
+def _read_final_psnr(runs: Sequence[Run]) -> dict[Any, float]:
+    """Return the test PSNR (dB) at the end of each run, by seed; runs without a score are left out."""
     ends = ((run["seed"], run["iterations"].get(str(run["final_iteration"]), {}).get("PSNR")) for run in runs)
     return {seed: psnr for seed, psnr in ends if psnr is not None}
 

@@ -53,6 +53,7 @@ def format_tex(report: Mapping[str, Any]) -> str:
 
 
 def _format_table(table: Table) -> str:
+    """Write a table in LaTeX. Columns that are the same in all rows stand in its caption instead."""
     columns = list(zip(table.header, *table.rows, strict=True))
     same = [column for column in columns if column[0] in _CONSTANT and len(set(column[1:])) == 1]
     header, *rows = zip(*(column for column in columns if column not in same), strict=True)

@@ -134,7 +134,7 @@ def from_events(folder: Path) -> list[Row]:
     clock = scalars.get("iter_time", [])
     if len(clock) < 3:
         raise UserError(f"the TensorBoard files in {folder} have no iter_time; give a saved console output instead")
-    seconds = _training_seconds(clock, sorted(rows))
+    seconds = _sum_training_seconds(clock, sorted(rows))
     walls = {scalar.step: scalar.wall_time for scalar in scalars.get(_SCORED, ())}
     for step, row in rows.items():
         row |= {"seconds": seconds[step]}
@@ -143,7 +143,7 @@ def from_events(folder: Path) -> list[Row]:
     return _make_rows(list(rows.values()), folder)
 
 
-def _training_seconds(clock: Sequence[ScalarEvent], scored: Sequence[int]) -> dict[int, float]:
+def _sum_training_seconds(clock: Sequence[ScalarEvent], scored: Sequence[int]) -> dict[int, float]:
     """Seconds until each scored iteration. clock: the times of iterations, in milliseconds, and when they were written.
 
     A score is written after the time of its iteration, so its pause lies in the gap that begins there.
@@ -202,6 +202,7 @@ def read_curve(kind: str, source: Path) -> tuple[list[Row], str]:
 
 
 def main() -> None:
+    """Write the CSV file that the command line asks for."""
     parser = ArgumentParser(
         prog="python -m applications.evaluation.peer_curve",
         description="Makes a CSV file for `full_eval.py --peer` from the output of another program.",

@@ -168,6 +168,7 @@ class Record:
     """full_eval.py's record of a model folder: `key` (Run.key, None if others made the model) and finished stages."""
 
     def __init__(self, model: Path) -> None:
+        """Read the record of a model folder, if it has one; a damaged record counts as none, with a warning."""
         self._path = model / RECORD
         self._content: dict[str, Any] = {}
         if self._path.is_file():
@@ -275,12 +276,13 @@ def check_folders(runs: Sequence[Run]) -> None:
                 )
         elif record.key != run.key:
             raise UserError(
-                f"{run.model} was trained with other options or data ({_differences(record.key, run.key)}); give the "
-                "option set another name, choose another --output_path, or remove that folder"
+                f"{run.model} was trained with other options or data ({_describe_differences(record.key, run.key)}); "
+                "give the option set another name, choose another --output_path, or remove that folder"
             )
 
 
-def _differences(there: dict, asked: dict) -> str:
+def _describe_differences(there: dict, asked: dict) -> str:
+    """Return a text on how the scene or the options of an existing model differ from those asked for."""
     if there.get("scene") != asked["scene"]:
         return f"scene {there.get('scene')}, asked for {asked['scene']}"
     return f"{' '.join(map(str, there.get('options', [])))}; asked for {' '.join(asked['options'])}"

@@ -100,14 +100,14 @@ def _list_warnings(runs: Sequence[Run], rows: Sequence[dict[str, Any]]) -> list[
         if len(values) > 1:
             lines.append(f"Trained with different {name}: {', '.join(sorted(values))}.")
     said = ((run, line) for run in runs for line in run["lines"] or () if line.startswith(_WARNING))
-    lines += dict.fromkeys(f"{_set_of(run)}: {line.removeprefix(_WARNING)}" for run, line in said)
+    lines += dict.fromkeys(f"{_name_set(run)}: {line.removeprefix(_WARNING)}" for run, line in said)
     for row in rows:
         if row["failed_seeds"]:
-            lines.append(f"{_set_of(row)}: means without failed seeds {row['failed_seeds']}.")
+            lines.append(f"{_name_set(row)}: means without failed seeds {row['failed_seeds']}.")
     return lines
 
 
-def _set_of(row: Mapping[str, Any]) -> str:
+def _name_set(row: Mapping[str, Any]) -> str:
     return " ".join(filter(None, (row["scene"], row["config"])))
 
 
@@ -221,16 +221,16 @@ def make_environment(kind: str) -> jinja2.Environment:
         trim_blocks=True, lstrip_blocks=True, finalize=_escape if kind == "md" else None,
     )  # fmt: skip
     made.filters |= {
-        "data_uri": _data_uri, "indented": _indent, "jpeg": _encode, "markdown": format_markdown,
+        "data_uri": _make_data_uri, "indented": _indent, "jpeg": _encode, "markdown": format_markdown,
         "no_list": _escape_start, "number": tables.format_number,
-        "one_line": lambda text: Markup(" ".join(text.split())), "relative": _relative, "run_title": name_run,
+        "one_line": lambda text: Markup(" ".join(text.split())), "relative": _make_relative, "run_title": name_run,
         "url": lambda path: quote(os.fsencode(path)),
     }  # fmt: skip
     return made
 
 
 @jinja2.pass_environment
-def _relative(made: jinja2.Environment, path: Path) -> str:
+def _make_relative(made: jinja2.Environment, path: Path) -> str:
     return os.path.relpath(path, made.globals["folder"])
 
 
@@ -281,7 +281,7 @@ def _count_trainings(runs: Sequence[Run]) -> str:
     return ", ".join(parts)
 
 
-def _data_uri(path: Path) -> str:
+def _make_data_uri(path: Path) -> str:
     """Return a figure as a data: URI; large ones become JPEG."""
     content = path.read_bytes()
     if len(content) <= _PHOTOGRAPHIC:
@@ -316,4 +316,5 @@ def _escape_start(text: str) -> Markup:
 
 
 def _indent(texts: Sequence[str]) -> Markup:
+    """Indent the lines of texts by four spaces, as Markdown shows code."""
     return Markup("\n".join(f"    {line}" for text in texts for line in text.splitlines()))

@@ -85,6 +85,7 @@ def read_run(run: Run, output: Path, failure: Failure | None) -> dict[str, Any]:
 
 
 def _read_curve(model: Path) -> list[Row]:
+    """Read the rows of a model's error curve; none, with a warning, if its file is damaged."""
     try:
         return folder_of.curve_of(model)
     except UserError as error:
@@ -111,6 +112,11 @@ def _read_views(model: Path, last: int) -> dict[str, Any]:
 
 
 def _split_views(model: Path, cameras: Any, held_out: int) -> str | None:
+    """Say how the test views were chosen, as an option of train.py or in words; None: not known.
+
+    cameras: the entries of cameras.json, test views first.
+    held_out: number of test views.
+    """
     if rule := read_model_json(model).get("holdout"):
         return f"--holdout {rule}"
     try:
@@ -156,9 +162,13 @@ def _read_iteration(model: Path, iteration: int, curve: list[Row]) -> dict[str, 
 
 
 def read_earlier(output: Path) -> dict[str, Any]:
-    """Read what the report in an output folder shows: runs and failures by model folder, peers, commands.
+    """Read what the report in an output folder shows, from its report.json.
 
-    scored: whether it has any score. Runs whose model folder is gone are left out.
+    Return a dictionary:
+    runs: (run, failure or None) by model folder; runs whose folder is gone are left out;
+    peers: curves of other programs (--peer), as `error_curve.peers_of` returns them;
+    commands: the commands that made the report, each a list of words;
+    scored: true if the report has any score.
     """
     nothing = {"runs": {}, "peers": [], "commands": [], "scored": False}
     path = output / REPORT
@@ -182,6 +192,7 @@ def read_earlier(output: Path) -> dict[str, Any]:
 
 
 def _restore_run(content: dict[str, Any], output: Path) -> tuple[Run, Failure | None]:
+    """Make a run and its failure, if any, from its entry in report.json. output: folder of the report."""
     source = content["source"]
     scene = SceneEntry(content["scene"], content["group"], source and Path(source))
     options, added = tuple(content["options"] or ()), tuple(content["added_options"] or ())

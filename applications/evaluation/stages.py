@@ -65,15 +65,15 @@ def train(run: Run, machine: dict[str, Any], child: Child) -> None:
     there = _list_checkpoints(run)
     before = record.stage("train_interrupted") or {}
     before = before if before.get("checkpoint") in there else {}
-    command = _script_path("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
+    command = _make_command("train.py", "-s", source, "-m", str(run.model), "--disable_viewer", "--quiet")
     command += ["--no_last_checkpoint", *run.options]
     command += ("--start_checkpoint", str(run.model / before["checkpoint"])) if before else ()
     done = child(command, "training" + _describe_start(before, record))
     spent = _sum_seconds(before, done)
     if done.status and (left := [name for name, stamp in _list_checkpoints(run).items() if stamp != there.get(name)]):
         stopped = done.interrupt and done.status in (128 + signal.SIGINT, 128 + signal.SIGTERM)
-        latest = max(left, key=_iteration_of)
-        stops = {"stops": [*before.get("stops", []), _iteration_of(latest)]} if stopped else {}
+        latest = max(left, key=_parse_iteration)
+        stops = {"stops": [*before.get("stops", []), _parse_iteration(latest)]} if stopped else {}
         record.note("train_interrupted" if stopped else "train_failed", checkpoint=latest, **stops, **spent)
     _require_success("train", command, done)
     for stop in before.get("stops", ()):
@@ -108,16 +108,22 @@ def _is_trained(run: Run, record: Record) -> bool:
 
 
 def _list_checkpoints(run: Run) -> dict[str, list[int]]:
-    """Return the names of checkpoints in the model folder before the last iteration, each with its `_stamp`."""
+    """Return the names of checkpoints in the model folder before the last iteration, each with its `_read_stamp`."""
     found = [path for path in run.model.glob("chkpnt*.pth") if re.fullmatch(r"\d+", path.stem[6:]) and path.is_file()]
-    return {path.name: _stamp(path) for path in found if _iteration_of(path.name) < (run.iterations or math.inf)}
+    return {
+        path.name: _read_stamp(path) for path in found if _parse_iteration(path.name) < (run.iterations or math.inf)
+    }
 
 
-def _iteration_of(checkpoint: str) -> int:
+def _parse_iteration(checkpoint: str) -> int:
     return int(checkpoint[6:-4])
 
 
 def _describe_start(before: dict[str, Any], record: Record) -> str:
+    """Return where a training starts, if not from nothing on: at a checkpoint, or anew after a failure.
+
+    before: the part of this training that was interrupted, {} without one.
+    """
     if before:
         return f" from {before['checkpoint']}"
     if failed := record.stage("train_failed"):
@@ -134,7 +140,8 @@ def _list_saved(run: Run, stage: str) -> list[int]:
     raise StageFailed(Failure(stage, [], [f"{run.model} has no saved iteration; train it first"]))
 
 
-def _source(run: Run) -> tuple[str, ...]:
+def _make_source_words(run: Run) -> tuple[str, ...]:
+    """Return the option -s with the folder of the scene, if that is known."""
     return ("-s", str(run.scene.source)) if run.scene.source else ()
 
 
@@ -164,14 +171,16 @@ def render(run: Run, options: Sequence[str], child: Child) -> None:
     options: more words for render.py.
     """
     for iteration in _list_saved(run, "render"):
-        command = _script_path("render.py", "-m", str(run.model), *_source(run), "--iteration", str(iteration))
+        command = _make_command(
+            "render.py", "-m", str(run.model), *_make_source_words(run), "--iteration", str(iteration)
+        )
         command += ["--skip_train", "--eval", "--quiet", *options]
-        requested = {"model": _stamp(saved_ply(run.model, iteration)), "options": list(options)}
+        requested = {"model": _read_stamp(saved_ply(run.model, iteration)), "options": list(options)}
         say, found = f"rendering iteration {iteration}", partial(_count_rendered, run.model, iteration)
         _run_once(child, Record(run.model), f"render_{iteration}", say, command, requested, found)
 
 
-def _stamp(file: Path) -> list[int]:
+def _read_stamp(file: Path) -> list[int]:
     """Return size and time of a file, to tell whether it changed without reading it."""
     state = file.stat()
     return [state.st_size, state.st_mtime_ns]
@@ -195,7 +204,7 @@ def score(run: Run, child: Child, download: bool = True, weights: Path | None = 
     if not methods:
         raise StageFailed(Failure("metrics", [], [f"{model} has no rendered test views; render them first"]))
     times = {method: model / "test" / method / TIMES for method in methods}  # render.py writes these last
-    renders = {method: _stamp(path) if path.is_file() else None for method, path in times.items()}
+    renders = {method: _read_stamp(path) if path.is_file() else None for method, path in times.items()}
     if None in renders.values() or not _is_scored(model, methods):
         record.forget("metrics")
     before = record.stage("metrics")
@@ -203,7 +212,7 @@ def score(run: Run, child: Child, download: bool = True, weights: Path | None = 
     given = {} if weights is None else {"weights": str(weights.resolve())}
     words = [f"--{name}={folder}" for name, folder in given.items()] + ["--stlpips"] * stlpips
     given |= {"stlpips": True} if stlpips else {}
-    command = _script_path("metrics.py", "-m", str(model), "--error_maps", *words)
+    command = _make_command("metrics.py", "-m", str(model), "--error_maps", *words)
     _run_once(
         child, record, "metrics", "scoring", command, {"renders": renders, **given}, dict,
         lambda: {"ground_truth_sha256": ground_truth_digest(model / "test" / methods[-1])}, **environment,
@@ -225,9 +234,9 @@ def write_page(run: Run, output: Path, options: Sequence[str], child: Child) -> 
     """
     last, file = _list_saved(run, "html")[-1], page_file(run.model, output)
     mkdir_p(file.parent)
-    command = _script_path("export.py", "-m", str(run.model), *_source(run), "--iteration", str(last))
+    command = _make_command("export.py", "-m", str(run.model), *_make_source_words(run), "--iteration", str(last))
     command += ["--to", str(file), "--raw", *options]  # what was scored
-    requested = {"model": _stamp(saved_ply(run.model, last)), "options": list(options)}
+    requested = {"model": _read_stamp(saved_ply(run.model, last)), "options": list(options)}
     say = "writing the model as a page"
     _run_once(child, Record(run.model), "html", say, command, requested, lambda: {} if file.is_file() else None)
 
@@ -239,7 +248,8 @@ def _is_scored(model: Path, methods: Sequence[str]) -> bool:
         return False
 
 
-def _script_path(name: str, *words: str) -> list[str]:
+def _make_command(name: str, *words: str) -> list[str]:
+    """Return the command that runs a script of the repository. words: its arguments."""
     return [sys.executable, str(_ROOT / name), *words]
 
 

@@ -47,26 +47,30 @@ class Cleaning:
     """
 
     def __init__(self, gaussians: GaussianModel, cameras: Sequence[Camera], views: ScoredViews, most: float) -> None:
+        """Score the whole model.
+
+        most: dB of its best PSNR that a view may lose.
+        """
         self._gaussians, self._cameras, self._views, self._most = gaussians, list(cameras), views, most
         self.keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
-        self.before = {id(camera): self._psnr(camera, gaussians) for camera in self._cameras}
+        self.before = {id(camera): self._measure_psnr(camera, gaussians) for camera in self._cameras}
         self.after = dict(self.before)
         self._best = dict(self.before)
 
-    def _part(self, keep: Tensor) -> GaussianModel:
+    def _make_part(self, keep: Tensor) -> GaussianModel:
         return self._gaussians.part(keep, self._gaussians.max_sh_degree)
 
-    def _psnr(self, camera: Camera, gaussians: GaussianModel) -> float:
+    def _measure_psnr(self, camera: Camera, gaussians: GaussianModel) -> float:
         return self._views.scores([camera], gaussians).get("psnr", float("inf"))
 
-    def _scores(self, keep: Tensor) -> dict[int, float] | None:
+    def _score_part(self, keep: Tensor) -> dict[int, float] | None:
         """Return the PSNR by view of a part of the model; None if a view loses too much.
 
         That view is scored first from then on.
         """
-        gaussians, found = self._part(keep), {}
+        gaussians, found = self._make_part(keep), {}
         for camera in self._cameras:
-            found[id(camera)] = self._psnr(camera, gaussians)
+            found[id(camera)] = self._measure_psnr(camera, gaussians)
             if self._best[id(camera)] - found[id(camera)] > self._most:
                 self._cameras.remove(camera)
                 self._cameras.insert(0, camera)
@@ -84,7 +88,7 @@ class Cleaning:
                 middle = (low + high) // 2
                 keep = self.keep.clone()
                 keep[order[:middle]] = False
-                tried = self._scores(keep) if keep.any() else None
+                tried = self._score_part(keep) if keep.any() else None
                 low, high, scores = (middle, high, tried) if tried else (low, middle, scores)
                 bar.update()
         if scores:
@@ -94,7 +98,7 @@ class Cleaning:
 
     def changes(self) -> Tensor:
         """Return by how much the views' errors change without each Gaussian, relative to these errors: (N,) float64."""
-        gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
+        gaussians, found = self._make_part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
         for camera in Bar(self._cameras, desc="Asking the photos", unit="view", leave=False):
             with torch.enable_grad():
                 image, target, mask = self._views.compared(camera, gaussians)
@@ -110,11 +114,11 @@ class Cleaning:
         The share is the sum of the Gaussian's blending weights, divided by the view's pixels and by its error. The
         views are the training views, and views between neighbours, which may show Gaussians that the photos do not.
         """
-        gaussians, found = self._part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
+        gaussians, found = self._make_part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
         errors = [max(10 ** (-self.after[id(camera)] / 10), _EXACT) for camera in self._cameras]
         pairs = neighbours(self._cameras, 0)
         between = chain.from_iterable(views_between(self._cameras[i], self._cameras[j]) for i, j in pairs)
-        coarse = ((_coarse(view), sum(errors) / len(errors)) for view in between)
+        coarse = ((_halve_view(view), sum(errors) / len(errors)) for view in between)
         views = chain(zip(self._cameras, errors, strict=True), coarse)
         count = len(errors) + len(FRACTIONS) * len(pairs)
         for camera, error in Bar(views, desc="Weighing Gaussians", total=count, unit="view", leave=False):
@@ -125,8 +129,8 @@ class Cleaning:
         return found.nan_to_num(0.0)
 
 
-def _coarse(view: MiniCam) -> MiniCam:
-    """Halve a view's width and height: a quarter of the work, with about the same shares of the image."""
+def _halve_view(view: MiniCam) -> MiniCam:
+    """Halve width and height of a view: a quarter of the work, with about the same shares of the image."""
     view.image_width, view.image_height = (max(1, size // 2) for size in (view.image_width, view.image_height))
     return view
 

@@ -146,7 +146,8 @@ def find_needed(
     return cleaning.keep.cpu().numpy()
 
 
-def _removed_picture(to: str) -> Path:
+def _name_removed_picture(to: str) -> Path:
+    """Name the picture of what was removed, beside the file of --to."""
     return Path(to).with_name(f"{Path(to).name}.removed.png")
 
 
@@ -175,7 +176,7 @@ def make_chooser(
     @functools.cache
     def needed(clean: bool) -> np.ndarray:
         most = args.clean or CLEAN_OPTION["const"]
-        return keep & find_needed(scene, most, pipe, options, _removed_picture(of_cleaned[0])) if clean else keep
+        return keep & find_needed(scene, most, pipe, options, _name_removed_picture(of_cleaned[0])) if clean else keep
 
     @functools.cache
     def chosen(clean: bool, thin: bool) -> Splats:
@@ -201,7 +202,7 @@ def export(args: argparse.Namespace, options: argparse.Namespace, pipe: argparse
         _refuse_to_replace_a_model(Path(to), args.ply)
     check_upright(args)
     for to in _list_cleaned_files(args)[:1]:
-        refuse_foreign(_removed_picture(to))
+        refuse_foreign(_name_removed_picture(to))
     needs_views = bool(args.max_splats or args.clean or args.walk) or follows_scene(args)
     needs_views |= any(entry.of_scene and (args.model_path or not entry.around) for entry in entries)
     splats, scene = load(args, options, needs_views, needs_photos=bool(args.clean))
@@ -248,6 +249,7 @@ def _describe_file(
 
 
 def _refuse_to_replace_a_model(file: Path, source: str | None) -> None:
+    """Raise UserError if a file to write is a folder, a trained model, or the source of the export."""
     if file.is_dir():
         raise UserError(f"--to {file} is a folder; give the name of a file")
     saved = file.absolute().parent.parent.name == "point_cloud"

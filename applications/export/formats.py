@@ -93,11 +93,16 @@ class Format:
     check: Callable[[str | os.PathLike], Any] = lambda path: None
 
 
-def _preview_path(page: str | os.PathLike) -> Path:
+def _name_preview(page: str | os.PathLike) -> Path:
+    """Return the path of the preview picture of a page, beside the page."""
     return Path(page).with_name(f"{Path(page).name}.jpg")  # no photo has such a name
 
 
 def _write_html(path: str | os.PathLike, splats: Splats, around: SceneInputs) -> None:
+    """Write a page with the model, and its preview picture beside it.
+
+    around: the cameras and the options of the export.
+    """
     from applications.export.html import write_html  # SciPy and jinja2 take a while to import
     from applications.export.notes import read_notes
     from applications.export.page_start import find_named, write_preview
@@ -117,23 +122,31 @@ def _write_html(path: str | os.PathLike, splats: Splats, around: SceneInputs) ->
         start = find_named(notes.views[0].camera, names, f"--notes: {notes.views[0].camera}")
     else:
         start = best_start(poses_of(around.cameras)) if names else 0
-    picture = _preview_path(path)
+    picture = _name_preview(path)
     how = around.make_path, around.background, around.title, start, quote(os.fsencode(picture.name))
     how = *how, around.upright, around.metric, notes, solid, around.pipe, around.once
     write_html(path, splats, around.cameras, *how)
     write_preview(picture, splats, around.cameras[start], around.pipe, around.background)
 
 
-def _mesh_format(
+def _make_mesh_format(
     ending: str,
     write: Callable[[str | os.PathLike, Mesh, Splats], None],
     what: str,
     check: Callable[[str | os.PathLike], None] = find_packages,
     with_texture: bool = True,
 ) -> Format:
-    """A format of meshes, with a texture or with colours of vertices."""
+    """Make a format of meshes.
+
+    ending: of the file's name.
+    write: writes a mesh to a path.
+    what: words for the help of --to.
+    check: raises UserError if a path cannot be written.
+    with_texture: true for a texture, false for colours of vertices.
+    """
 
     def write_mesh(path: str | os.PathLike, splats: Splats, around: SceneInputs) -> str:
+        """Make the mesh, or take that of another file of this export, and write it; return a line on it."""
         from applications.export.mesh import make_mesh, measure_surfaces  # as does this
 
         measured = around.once("surfaces", measure_surfaces, splats, around.cameras, around.pipe, around.voxel)
@@ -158,10 +171,10 @@ def _write_lod_meta(path: str | os.PathLike, splats: Splats, around: SceneInputs
 
 # An ending that ends with another one comes before it.
 FORMATS = (
-    _mesh_format("mesh.ply", write_ply_mesh, "surfaces, as coloured triangles", with_texture=False),
-    _mesh_format("mesh.glb", write_glb_mesh, "surfaces with a texture, as glTF"),
-    _mesh_format("mesh.obj", write_obj_mesh, "the same, with .mtl and .png beside it", check_obj_mesh),
-    _mesh_format("mesh.usdz", write_usdz_mesh, "the same, as OpenUSD", check_usdz_mesh),
+    _make_mesh_format("mesh.ply", write_ply_mesh, "surfaces, as coloured triangles", with_texture=False),
+    _make_mesh_format("mesh.glb", write_glb_mesh, "surfaces with a texture, as glTF"),
+    _make_mesh_format("mesh.obj", write_obj_mesh, "the same, with .mtl and .png beside it", check_obj_mesh),
+    _make_mesh_format("mesh.usdz", write_usdz_mesh, "the same, as OpenUSD", check_usdz_mesh),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
     Format(".ply", write_plain_ply, "Gaussians in float32, everything kept", in_order=True),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
@@ -189,7 +202,7 @@ FORMATS = (
         ("path", "start", "title", "notes", "walk", "raw"),
         around=True,
         clean=True,
-        check=lambda path: refuse_foreign(_preview_path(path)),
+        check=lambda path: refuse_foreign(_name_preview(path)),
     ),
 )
 

@@ -43,7 +43,7 @@ UP = np.array([0.0, -1.0, 0.0])  # of the turned model, as in a usual capture
 _MEAN_UP = 0.01  # weight of the mean up beside the cameras' horizons
 BOOKMARKS = 10  # where no notes say which
 _TITLE = 60  # letters of their titles, as the viewer has it
-_ASIDE, _UNDER = 0.5, 0.25  # of the usual depth, by which guests may leave the cameras' box, sideways and down
+_ASIDE, _UNDER = 0.5, 0.25  # of the usual depth, by which visitors may leave the cameras' box, sideways and down
 _USUAL_DEPTH = 2.0  # metres from a camera to what it looks at, where nothing tells the scale
 SOLID = "model:/solid.voxel.json"  # where the viewer asks for what is solid; page.js answers
 _KEYS_A_SECOND = 10
@@ -77,16 +77,21 @@ def write_html(
     pipe: argparse.Namespace = _PLAIN,
     once: Callable[..., str] = lambda _, make, *given: make(*given),
 ) -> None:
-    """Write the page, whole or not at all.
+    """Write the page, whole or not at all. UserError without a camera.
 
-    cameras: the training views; those that the notes name become bookmarks, or up to 10 of them. make_path: makes the
-    animation from their poses, as camera_paths.render_path does. None: the viewer's own, which goes around
-    the model, or sways where the page's first camera is in the model's box. background: RGB in [0,1]. title: None: that
-    of the notes, or the file's name. start: which camera the page begins at. picture: address of an image that is shown
-    beside a link to the page; empty: none. upright: whether up is UP already; if not, it is found by the cameras.
-    metric: whether a unit is a metre; if not, a headset shows the model as if photos were taken from two metres. solid:
-    what guests stop at, in the viewer's axes; None: they cannot walk. pipe: pipeline options, by which notes find the
-    surface. once: calls what makes the packed model, or gives that of a page before. UserError without a camera.
+    cameras: the training views; those that the notes name become bookmarks, or else up to 10 of them.
+    make_path: makes the animation from the poses of the cameras; None: the viewer's own animation, around the model, or
+    swaying where the page's first camera is in the model's box.
+    background: RGB in [0, 1].
+    title: None: that of the notes, or the file's name.
+    start: index of the camera that the page begins at.
+    picture: address of an image that is shown beside a link to the page; empty: none.
+    upright: true if up is UP already; else the direction is found by the cameras.
+    metric: true if a unit is a metre; else a headset shows the model as if photos were taken from two metres.
+    notes: texts on views; None: none.
+    solid: what visitors of the page stop at, in the viewer's axes; None: visitors cannot walk.
+    pipe: pipeline options, by which the point that a note is about is found on the surface.
+    once: calls what makes the packed model, or returns what was made for a page before.
     """
     if not cameras:
         raise UserError("a page needs at least one training camera, from which it shows the model; the scene has none")
@@ -136,6 +141,7 @@ def _encode_base64(content: bytes) -> str:
 
 
 def _pack_model(splats: Splats) -> str:
+    """Return the model as a compressed PLY file in gzip and Base64. UserError if browsers cannot read so much."""
     content = io.BytesIO()
     packed_ply(splats).write(content)
     packed = _encode_base64(gzip.compress(content.getbuffer(), mtime=0))
@@ -180,13 +186,20 @@ def make_settings(
     notes: Sequence[Note] = (),
     thing: Callable[[Note, int, float], np.ndarray] | None = None,
 ) -> dict[str, Any]:
-    """The settings of a model that was turned by `turn` (3,3).
+    """Return the settings of the viewer, a JSON object, for a model that was turned by `turn` (3, 3).
 
-    poses, names: of the training cameras before that. path: the animation, in the same frame. background: RGB in [0,1].
-    distance: of the model, about which cameras that are all in one place turn. start: which camera the viewer begins
-    at. aspects: width over height of the photos; None: all are square. notes: the bookmarks; none: BOOKMARKS cameras.
-    thing: the point that a note means, of a camera with that index and usual depth. Opening angles are vertical, in
-    degrees.
+    poses, names: of the training cameras, before the turn.
+    turn: rotation (3, 3) from the scene's axes to upright ones.
+    path: the animation, in the frame of the poses; None: no animation.
+    background: RGB in [0, 1].
+    distance: distance to the model, around which the view turns, where all cameras are in one place and tell none.
+    start: index of the camera that the viewer begins at.
+    aspects: width over height of each photo; None: all are square.
+    notes: the bookmarks with texts; without any, there are BOOKMARKS of the cameras.
+    thing: returns the point (3,) that a note is about, in the frame of the poses. Its arguments are the note, the index
+    of the note's camera and the usual depth of what that camera shows.
+
+    Opening angles are vertical, in degrees.
     """
     aspects = aspects or [1.0] * len(poses)
     axes = _VIEWER_AXES @ turn
@@ -242,9 +255,12 @@ def _find_noted_point(
 
 
 def find_limits(poses: Poses, axes: np.ndarray, depth: float) -> list[list[float]]:
-    """Return opposite corners, in the viewer's world, of the box for guests: the cameras' box and a margin.
+    """Return the lowest and the highest corner [x, y, z] of the box in which visitors of the page may move.
 
-    depth: of what the cameras look at.
+    The box is that of all cameras with a margin, in the viewer's world: x right, y up, z backwards, the model's scale.
+
+    axes: (3, 3), from the model's axes to the viewer's.
+    depth: distance from the cameras to what they usually look at.
     """
     places = poses.positions @ axes.T
     room = depth * np.array([_ASIDE, _UNDER, _ASIDE])
@@ -281,6 +297,11 @@ def _make_bookmark(name: str, text: str, camera: dict[str, Any], degrees: float,
 
 
 def _make_track(path: TimedPath, axes: np.ndarray, depth: float) -> dict[str, Any]:
+    """Return the viewer's animation of a camera path, with evenly spaced keyframes.
+
+    axes: (3, 3), from the path's axes to the viewer's.
+    depth: distance from each position to the point that the camera looks at.
+    """
     count = max(2, min(_MOST_KEYS, round(path.seconds * _KEYS_A_SECOND) + 1))
     rate = (count - 1) / path.seconds
     frames = range(count - path.closed)  # the end of a closed path is its beginning

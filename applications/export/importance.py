@@ -35,10 +35,10 @@ _ALIKE = 0.125  # of the count asked for: the last ones are not asked again
 def change_without(values: Tensor, gaussians: GaussianModel, factors: Tensor | None = None) -> Tensor:
     """The change of a sum of rendered values times factors without each Gaussian, by the derivative: (N,) float64."""
     (slope,) = torch.autograd.grad(values, gaussians.raw("opacity"), factors, retain_graph=True)
-    return _removal(slope, gaussians)
+    return _compute_removal(slope, gaussians)
 
 
-def _removal(slope: Tensor, gaussians: GaussianModel) -> Tensor:
+def _compute_removal(slope: Tensor, gaussians: GaussianModel) -> Tensor:
     """Opacity times minus the derivative by it, from the derivative by its logit (N, 1): (N,) float64."""
     transparency = (1 - gaussians.get_opacity.detach()[:, 0]).clamp_min(_SOLID)
     return -(slope[:, 0] / transparency).double()
@@ -55,7 +55,7 @@ def most_needed(gaussians: GaussianModel, cameras: Sequence[Camera], views: Scor
             part = gaussians.part(left, gaussians.max_sh_degree)
             errors, now = torch.zeros(2, len(left), dtype=torch.float64, device=left.device)
             for camera in cameras:  # the whole model's images of many photos would not fit into the memory
-                first, second = _terms(camera, part, views, views.image(camera, gaussians), signs)
+                first, second = _compute_terms(camera, part, views, views.image(camera, gaussians), signs)
                 errors, now = errors + first, now + second
             squares = now if squares is None else _MEMORY * squares + (1 - _MEMORY) * now
             order = torch.argsort((_TRUST * errors + squares).nan_to_num(0.0), descending=True, stable=True)
@@ -68,7 +68,7 @@ def most_needed(gaussians: GaussianModel, cameras: Sequence[Camera], views: Scor
     return torch.cat([left, *reversed(gone)])[:count]
 
 
-def _terms(
+def _compute_terms(
     camera: Camera, part: GaussianModel, views: ScoredViews, whole: Tensor, signs: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Both terms (N,) float64 of the growth of the mean squared error of a part's view against the whole model's."""
@@ -81,5 +81,5 @@ def _terms(
     parameters = part.raw("opacity"), part.raw("f_dc")
     slope, tint = torch.autograd.grad(image, parameters, counted * random)
     weights = tint[:, 0].double() / C0
-    second = _removal(slope, part).square() + (_BEHIND * weights).square().sum(dim=1)
+    second = _compute_removal(slope, part).square() + (_BEHIND * weights).square().sum(dim=1)
     return first / image.numel(), second / image.numel()

@@ -67,16 +67,16 @@ def build_octree(splats: Splats, most: int = MOST, name: str = "r") -> Tile:
 
     A cell is split at the middle of the box of its means, so that a far Gaussian does not leave the others in one cell.
     """
-    low, high = _bounds(splats.means.astype(np.float64))
+    low, high = _find_bounds(splats.means.astype(np.float64))
     if len(splats) <= most or not (high > low).any() or len(name) > _DEEPEST:
-        return Tile(name, splats, (), 0.0, *_box(splats))
+        return Tile(name, splats, (), 0.0, *_find_box(splats))
     octants = (splats.means > (low + high) / 2) @ np.array([1, 2, 4])
     children = tuple(build_octree(selected(splats, octants == k), most, f"{name}{k}") for k in np.unique(octants))
     below = join_splats([child.splats for child in children])
     order, starts = group_splats(below, GROUP)
     own, spread = merge_groups(selected(below, order), starts)
     error = max(child.error for child in children) + float(np.sqrt(np.mean(spread**2)))
-    corners = [_box(own), *((child.low, child.high) for child in children)]
+    corners = [_find_box(own), *((child.low, child.high) for child in children)]
     lows, highs = zip(*corners, strict=True)
     return Tile(name, own, children, error, np.min(lows, axis=0), np.max(highs, axis=0))
 
@@ -87,14 +87,16 @@ def join_splats(several: Sequence[Splats]) -> Splats:
     return replace(several[0], **{name: np.concatenate([getattr(some, name) for some in several]) for name in names})
 
 
-def _bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner (3,) of the box of points (N, 3); zeros without points."""
     return (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
 
 
-def _box(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
+def _find_box(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and the highest corner (3,) of a box that holds the Gaussians' extents of _REACH deviations."""
     reach = _REACH * np.sqrt(np.diagonal(covariances(splats), axis1=1, axis2=2))
-    low, _ = _bounds(splats.means - reach)
-    _, high = _bounds(splats.means + reach)
+    low, _ = _find_bounds(splats.means - reach)
+    _, high = _find_bounds(splats.means + reach)
     return low, high
 
 
@@ -141,11 +143,11 @@ def measure_losses(
         full = views.image(camera, models[-1])
         for model, values in zip(models, found, strict=True):
             image = full if model is models[-1] else views.image(camera, model)
-            values["psnr"].append(_psnr(image - full))
+            values["psnr"].append(_compute_psnr(image - full))
             if have_photos:
-                values["photos"].append(_psnr(image - as_float(views.target(camera)), views.mask(camera)))
+                values["photos"].append(_compute_psnr(image - as_float(views.target(camera)), views.mask(camera)))
     return [{name: mean_psnr(each) for name, each in values.items()} for values in found]
 
 
-def _psnr(difference: torch.Tensor, mask: torch.Tensor | None = None) -> float:
+def _compute_psnr(difference: torch.Tensor, mask: torch.Tensor | None = None) -> float:
     return float(-10 * pixels_that_count(difference, mask).double().square().mean().log10())

@@ -48,7 +48,11 @@ class Mesh:
 def measure_surfaces(
     splats: Splats, cameras: Sequence[Camera], pipe: argparse.Namespace, voxel: float | None = None
 ) -> tuple[Surfaces, Volume]:
-    """Surfaces of splats and the distances from them. UserError as for `Surfaces` and `fuse_volume`."""
+    """Return the surfaces of splats that the cameras see, and the distances from these surfaces in voxels.
+
+    voxel: side of a voxel in the unit of the model; None: about two pixels at the usual depth.
+    UserError without cameras or surfaces, and for a voxel that is far below a pixel or makes too many.
+    """
     surfaces = Surfaces(splats, cameras, pipe)
     return surfaces, fuse_volume(surfaces, voxel)
 
@@ -84,7 +88,7 @@ def fuse_volume(surfaces: Surfaces, voxel: float | None = None) -> Volume:
     pixel = surfaces.pixel
     small = voxel is not None and SIDE * voxel < pixel  # blocks around the surface in neighbouring pixels do not touch
     size = _PIXELS * pixel if voxel is None or small else voxel
-    volume = _empty_volume(surfaces, size, coarser=voxel is None or small)
+    volume = _make_empty_volume(surfaces, size, coarser=voxel is None or small)
     if small:
         usual = f"which is {pixel:.2g} at the usual depth"
         raise UserError(f"--voxel {voxel:g} is far below a pixel, {usual}; give {volume.voxel:.2g} or more")
@@ -93,7 +97,7 @@ def fuse_volume(surfaces: Surfaces, voxel: float | None = None) -> Volume:
     return volume
 
 
-def _empty_volume(surfaces: Surfaces, voxel: float, coarser: bool) -> Volume:
+def _make_empty_volume(surfaces: Surfaces, voxel: float, coarser: bool) -> Volume:
     """The blocks of all surfaces, empty. coarser: of a larger voxel, where they would be too many."""
     given = voxel
     while True:
@@ -114,9 +118,10 @@ def _empty_volume(surfaces: Surfaces, voxel: float, coarser: bool) -> Volume:
 
 
 def extract_zero_level(volume: Volume, confirmed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices and faces, as of `Mesh`, of the surfaces that `confirmed` views see. UserError if there are none.
+    """Return vertices (V, 3) and faces (F, 3) of the surfaces that views see, and the weights (V,) of the vertices.
 
-    Also the weights (V,) of the vertices, as of the volume.
+    confirmed: number of views that have to see a surface.
+    A weight is that of the volume there, which counts pixels of the views. UserError if there are no surfaces.
     """
     from skimage.measure import marching_cubes
 

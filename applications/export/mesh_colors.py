@@ -38,7 +38,12 @@ def average_colors(
 
 
 def color_points(points: np.ndarray, normals: np.ndarray, surfaces: Surfaces, voxel: float) -> np.ndarray:
-    """Colours (P, 3) uint8; points that no view sees have the colour of the nearest that one sees."""
+    """Return the colours (P, 3) uint8 of points on a surface; points that no view sees take that of the nearest seen.
+
+    points: (P, 3), and normals (P, 3) of unit length.
+    surfaces: depths and colours that the training views show.
+    voxel: side of the voxels that the surface was made from, which scales how near a point must be to a seen surface.
+    """
     from scipy.spatial import KDTree
 
     colors, seen = average_colors(points, normals, surfaces, voxel)

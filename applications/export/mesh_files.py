@@ -69,7 +69,7 @@ def write_ply_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
 
 def write_glb_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
     """Write a GLB, whole or not at all. UserError if it is too large. splats: those of the mesh, with its place."""
-    picture = _jpeg(mesh)
+    picture = _encode_jpeg(mesh)
     arrays = {
         "POSITION": mesh.vertices.astype("<f4"),
         "NORMAL": mesh.normals.astype("<f4"),
@@ -111,7 +111,8 @@ def write_glb_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
     write_binary_gltf(path, document, arrays.values(), "give fewer --triangles")
 
 
-def _jpeg(mesh: Mesh) -> bytes:
+def _encode_jpeg(mesh: Mesh) -> bytes:
+    """Return the texture of a mesh as a JPEG file."""
     content = io.BytesIO()
     Image.fromarray(mesh.texture).save(content, "JPEG", quality=_QUALITY, subsampling=0)
     return content.getvalue()
@@ -127,12 +128,13 @@ def check_obj_mesh(path: str | os.PathLike) -> None:
     refuse_foreign(Path(path).with_suffix(".png"))
     material = Path(path).with_suffix(".mtl")
     if os.path.lexists(material) and not (
-        material.is_file() and material.read_text("utf-8", "replace") == _material_path(path)
+        material.is_file() and material.read_text("utf-8", "replace") == _format_material(path)
     ):
         raise UserError(f"no export wrote {material}, and this one would replace it; move it, or choose another --to")
 
 
-def _material_path(path: str | os.PathLike) -> str:
+def _format_material(path: str | os.PathLike) -> str:
+    """Return the text of an MTL file whose texture is the PNG beside the mesh. path: of the mesh."""
     return f"newmtl mesh\nKd 1 1 1\nillum 0\nmap_Kd {Path(path).stem}.png\n"
 
 
@@ -140,7 +142,7 @@ def write_obj_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None:
     """Write an OBJ, and beside it its material and its texture, each whole or not at all."""
     write_picture(Path(path).with_suffix(".png"), Image.fromarray(mesh.texture))
     with atomic_write(Path(path).with_suffix(".mtl")) as temporary:
-        temporary.write_text(_material_path(path), encoding="utf-8")
+        temporary.write_text(_format_material(path), encoding="utf-8")
     with atomic_write(path) as temporary, open(temporary, "w", encoding="utf-8") as file:
         file.write(f"mtllib {Path(path).stem}.mtl\nusemtl mesh\n")
         turn = np.float32([1, -1, -1])
@@ -154,7 +156,7 @@ def write_usdz_mesh(path: str | os.PathLike, mesh: Mesh, splats: Splats) -> None
     """Write a USDZ, whole or not at all."""
 
     def fill(usd: ModuleType, stage: object, folder: Path) -> None:
-        (folder / "texture.jpg").write_bytes(_jpeg(mesh))
+        (folder / "texture.jpg").write_bytes(_encode_jpeg(mesh))
         vt, geom = usd.Vt, usd.UsdGeom
         shape = geom.Mesh.Define(stage, "/World/Mesh")
         geom.Xformable(shape).AddRotateXOp().Set(180.0)

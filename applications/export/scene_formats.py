@@ -68,9 +68,11 @@ def write_compressed_glb(path: str | os.PathLike, splats: Splats) -> None:
 def georeference(document: dict, place: tuple[float, ...]) -> None:
     """Let the first node of a document tell where on Earth it is, by EXT_georeference, final draft of August 2026.
 
-    place: as of `Splats`; empty: nothing changes. Programs that know the extension put -x of the turned node to the
-    east, y up and +z to the north; others show the same model, turned half around its vertical. EXIF data usually count
-    heights from the sea level, and the extension from the ellipsoid, so the height, which is optional, is left out.
+    Programs that know the extension put -x of the turned node to the east, y up and +z to the north; others show the
+    same model, turned half around its vertical. EXIF data usually count heights from the sea level, and the extension
+    from the ellipsoid, so the height, which is optional, is left out.
+
+    place: latitude and longitude (degrees) and height (metres) of the model's origin; empty: nothing changes.
     """
     if not place:
         return
@@ -105,6 +107,7 @@ def write_binary_gltf(
 
 
 def _list_attributes(splats: Splats) -> dict[str, np.ndarray]:
+    """Return the arrays (N, ...) of a GLB with splats, by glTF's name of the attribute."""
     values = {
         "POSITION": splats.means,
         "COLOR_0": rgba_bytes(splats),
@@ -119,6 +122,12 @@ def _list_attributes(splats: Splats) -> dict[str, np.ndarray]:
 
 
 def _make_document(attributes: dict[str, np.ndarray], sizes: list[int], antialiasing: bool) -> dict:
+    """Return the JSON part of a GLB.
+
+    attributes: arrays by name, as `_list_attributes` returns them.
+    sizes: bytes of each attribute in the binary part, in the order of `attributes`.
+    antialiasing: true if the model was trained with it.
+    """
     node = {"name": "splats", "rotation": [1, 0, 0, 0]}
     document = {
         "asset": {"version": "2.0", "generator": "export.py", "extras": {"antialiasing": antialiasing}},
@@ -150,6 +159,7 @@ def _make_document(attributes: dict[str, np.ndarray], sizes: list[int], antialia
 
 
 def _make_accessor(index: int, name: str, values: np.ndarray) -> dict:
+    """Describe one attribute for glTF. index: number of its view of the buffer; values: (N, components)."""
     is_byte = values.dtype == np.uint8
     accessor = {
         "bufferView": index,
@@ -231,6 +241,7 @@ def find_pxr(path: str | os.PathLike) -> ModuleType:
 
 
 def _add_splats(usd: ModuleType, stage: Any, splats: Splats) -> None:
+    """Add the prim with the splats to a USD stage. usd: the package `pxr`."""
     field = usd.UsdVol.ParticleField3DGaussianSplat.Define(stage, PRIM)
     usd.UsdGeom.Xformable(field).AddRotateXOp().Set(180.0)
     field.GetPrim().SetCustomDataByKey("antialiasing", bool(splats.antialiasing))

@@ -31,7 +31,7 @@ class Surfaces:
         if not self.views:
             raise UserError("a mesh needs training cameras, from which it sees the surfaces; the scene has none")
         tried = self.views[:: -(-len(self.views) // _TRIED)]
-        spans = [_measure_pixel(view, self._surface(view).depth) for view in tried]
+        spans = [_measure_pixel(view, self._render_surface(view).depth) for view in tried]
         if not any(spans):
             raise UserError("a mesh needs surfaces, and no training view shows anything opaque; train for longer")
         depth, self.pixel = np.median([span for span in spans if span], axis=0).tolist()
@@ -44,10 +44,10 @@ class Surfaces:
     def each(self, what: str) -> Iterator[tuple[Camera | MiniCam, Surface]]:
         """Each view with its surface, whose depth is 0 beyond _FAR. what: for the progress bar."""
         for view in Bar(self.views, desc=what, unit="view"):
-            depth, color = self._surface(view)
+            depth, color = self._render_surface(view)
             yield view, Surface(torch.where(depth < self._far, depth, 0), color)
 
-    def _surface(self, view: Camera | MiniCam) -> Surface:
+    def _render_surface(self, view: Camera | MiniCam) -> Surface:
         return surface_of(view, self._gaussians, self._pipe)
 
 

@@ -64,6 +64,7 @@ def make_document(root: Tile, folder: str, compressed: bool = False) -> dict[str
 
 
 def _make_entry(tile: Tile, folder: str) -> dict[str, Any]:
+    """Return the entry of a tile and of the tiles below it. folder: of the GLB files, relative to tileset.json."""
     entry = {"boundingVolume": {"box": make_box(tile.low, tile.high)}, "geometricError": tile.error}
     if len(tile.splats):
         entry["content"] = {"uri": f"{folder}/{tile.name}.glb"}
@@ -82,10 +83,13 @@ def make_box(low: np.ndarray, high: np.ndarray) -> list[float]:
 
 
 def place_on_globe(place: tuple[float, ...]) -> list[float]:
-    """The transform from metres east, north and up of a place, as of `Splats`, to EPSG:4978: 16 numbers by columns.
+    """Return the transform from metres east, north and up of a place to EPSG:4978: 16 numbers by columns.
 
     Formulas of geodetic coordinates: EPSG guidance note 7-2, 4.1.1. The height counts from the ellipsoid here, and in
-    EXIF data usually from the sea level, which is up to 107 m away.
+    EXIF
+    data usually from the sea level, which is up to 107 m away.
+
+    place: latitude and longitude (degrees) and height (metres).
     """
     (sin_b, cos_b), (sin_l, cos_l) = ((np.sin(angle), np.cos(angle)) for angle in np.radians(place[:2]))
     east, up = np.array([-sin_l, cos_l, 0]), np.array([cos_b * cos_l, cos_b * sin_l, sin_b])

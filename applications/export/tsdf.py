@@ -67,7 +67,7 @@ class Volume:
         """Add what a view says: depth (H, W), 0: unknown."""
         members = _MEMBERS.to(self.keys.device)
         for rows in torch.arange(len(self.keys), device=self.keys.device).split(_AT_ONCE):
-            rows = rows[self._in_view(camera, rows)]
+            rows = rows[self._find_in_view(camera, rows)]
             places = _decode_keys(self.keys[rows])[:, None] * SIDE + members
             at, axial = _find_pixels(camera, places.reshape(-1, 3).float() * self.voxel, depth.shape)
             seen = depth.flatten()[at.clamp_min(0)]
@@ -78,7 +78,7 @@ class Volume:
             self.weights[rows] += weights.view(-1, SIDE**3)
             self.views[rows] += counts.view(-1, SIDE**3)
 
-    def _in_view(self, camera: Camera | MiniCam, rows: Tensor) -> Tensor:
+    def _find_in_view(self, camera: Camera | MiniCam, rows: Tensor) -> Tensor:
         """(R,) bool: blocks that reach into a view's pyramid, with some margin."""
         middles = (_decode_keys(self.keys[rows]).float() * SIDE + (SIDE - 1) / 2) * self.voxel
         clip = middles @ camera.full_proj_transform[:3] + camera.full_proj_transform[3]

@@ -61,6 +61,7 @@ def make_walkable(splats: Splats, around: "SceneInputs") -> tuple[Splats, "Scene
 
 
 def _move_all(splats: Splats, around: "SceneInputs", similarity: Similarity) -> tuple[Splats, "SceneInputs"]:
+    """Move the splats and the inputs of the export by a similarity."""
     return move_splats(splats, similarity), move_inputs(around, similarity)
 
 

@@ -64,6 +64,7 @@ def scene_of(dataset: Mapping[str, Any], start: StartOptions) -> SceneInfo:
         views.append(view_of(camera, index, name, path, **photo))
 
     def own() -> StartCloud:
+        """Make the start cloud of the data set's points, or random points if there are none."""
         points, colors = dataset["points3D_xyz"], dataset["points3D_rgb"]
         if points is None:
             return StartCloud(random(), None, is_random=True)

@@ -90,6 +90,10 @@ class GaussianSplatting(Method):
         train_dataset: Mapping[str, Any] | None = None,
         config_overrides: Mapping[str, Any] | None = None,
     ) -> None:
+        """Start or resume a training, or load a model if there is nothing to train.
+
+        train_dataset: NerfBaselines' data set; None: only render.
+        """
         before = read_json(Path(checkpoint) / RECORD) if checkpoint else {"step": 0, "options": {}}
         self._given = before["options"] | dict(config_overrides or {})
         if train_dataset is not None and has_white_background(train_dataset):
@@ -99,14 +103,14 @@ class GaussianSplatting(Method):
         self._run: Run | None = None
         self._at: Iteration | None = None
         if train_dataset is not None and self._step < self._options[1].iterations:
-            self._begin(train_dataset)
+            self._begin_training(train_dataset)
             self._gaussians = self._run.gaussians
         else:
             self._gaussians = read_model(find_save(checkpoint, -1)[1])
         white = torch.full((3,), float(self._options[0].white_background), device=compute_device())
         self._views = ScoredViews(self._options[2], white, False)
 
-    def _begin(self, dataset: Mapping[str, Any]) -> None:
+    def _begin_training(self, dataset: Mapping[str, Any]) -> None:
         """Start a training, or resume that of the checkpoint."""
         folder = Path(tempfile.mkdtemp(prefix="gaussian-splatting-"))
         self._removal = weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
@@ -169,7 +173,7 @@ class GaussianSplatting(Method):
         self._pause.enter_context(self._run.clock.paused("between steps"))
         return told
 
-    def _look(self) -> Any:
+    def _view_model(self) -> Any:
         """Make a context in which the model is the one after the last step."""
         if self._run is None:
             return nullcontext()
@@ -182,7 +186,7 @@ class GaussianSplatting(Method):
     def render(self, camera: Any, *, options: Mapping[str, Any] | None = None) -> dict[str, np.ndarray]:
         """One view of NerfBaselines: color, (H, W, 3) float32 in [0, 1]."""
         view = view_of(camera.item())
-        with self._look():
+        with self._view_model():
             image = self._views.whole(Camera(view, (view.width, view.height), 0), self._gaussians)
         return {"color": image.permute(1, 2, 0).cpu().numpy()}
 
@@ -196,7 +200,7 @@ class GaussianSplatting(Method):
         options = run.options
         options.source_path = options.model_path = ""  # they lie in a temporary folder
         folder.mkdir(parents=True, exist_ok=True)
-        with self._look():
+        with self._view_model():
             save_checkpoint(folder / f"chkpnt{iteration}.pth", run.checkpoint_state(), iteration)
             self._gaussians.save_ply(str(saved_ply(folder, iteration)))
         run.log.add(iteration, run.clock.seconds, gaussians=self._gaussians.gaussian_count, loss=run.losses.mean)

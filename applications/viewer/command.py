@@ -59,6 +59,7 @@ def find_kept(
 
 
 def main() -> None:
+    """Show the model or the scene that the command line names, until the page is closed."""
     parser = OptionParser(description="Show a trained model on a web page, until Ctrl-C.")
     model_params = ModelParams(parser, sentinel=True)
     pipeline_params = PipelineParams(parser, sentinel=True)

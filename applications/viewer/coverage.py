@@ -24,6 +24,10 @@ class PointCoverage:
     """Coverage of points (P, 3) of the world by views."""
 
     def __init__(self, points: Tensor, views: Sequence[Camera]) -> None:
+        """Precompute which views have which points in their frame.
+
+        points: (P, 3).
+        """
         self._points, self._centers = points, torch.stack([view.camera_center for view in views])
         projections = torch.stack([view.full_proj_transform for view in views])
         clip = points @ projections[:, :3] + projections[:, 3:]  # (views, points, 4)
@@ -46,6 +50,7 @@ class Coverage:
     """A grid of cells around training views. size: of the scene."""
 
     def __init__(self, views: Sequence[Camera], size: float) -> None:
+        """Lay a grid of cells around the views. size: of the scene, in its unit."""
         some = views[:: -(-len(views) // _MOST) or 1]
         self._middle, self._size = torch.stack([view.camera_center for view in some]).mean(0), size
         side = (2 * torch.arange(_CELLS, device=self._middle.device) + 1) / _CELLS - 1

@@ -49,7 +49,7 @@ class Divider:
             drawn = self._drawn[client.client_id] = client.scene.add_mesh_simple(
                 _NAME, *_make_shape(), color=(255, 255, 255), side="double", cast_shadow=False, receive_shadow=False
             )
-            drawn.on_drag(self._drag)
+            drawn.on_drag(self._follow_drag)
         from viser.transforms import SO3
 
         self._cameras[client.client_id] = camera
@@ -58,7 +58,8 @@ class Divider:
         drawn.position = camera_center(camera.R, camera.T) + self._away * (turn[:, 2] + across * turn[:, 0])
         drawn.wxyz, drawn.scale, drawn.visible = SO3.from_matrix(turn).wxyz, self._away * slope, True
 
-    async def _drag(self, event: Any) -> None:
+    async def _follow_drag(self, event: Any) -> None:
+        """Tell the page where a browser has dragged the line to, as a share of the frame's width."""
         camera = self._cameras.get(event.client_id)
         if camera is not None:
             self._dragged(find_share(event.end_screen_pos[0], camera, *read_window(event.client.camera)))

@@ -38,15 +38,20 @@ class Frame(NamedTuple):
 
 
 class Frames:
-    """Draws frames of a model. with_exposures: as `use_trained_exp` of `render`, for an image beside its target.
+    """Draws frames of a model, in one thread. Nothing of the model changes.
 
-    kept: (N,) bool, what cleaning leaves, None: nobody asked. coverage: of the training views, None: not known. Used by
-    one thread. Nothing of the model changes.
+    kept: (N,) bool, Gaussians that cleaning leaves; None: nobody asked.
+    coverage: of the training views; None: not known.
     """
 
     def __init__(
         self, gaussians: GaussianModel, cameras: SceneCameras, pipe: argparse.Namespace, with_exposures: bool
     ) -> None:
+        """Prepare to draw frames of a model.
+
+        cameras: of the scene, whose photos frames are compared with.
+        with_exposures: true to draw an image beside its target with the trained exposure.
+        """
         self.gaussians = gaussians
         self._cameras = cameras
         self._pipe = pipe
@@ -64,21 +69,21 @@ class Frames:
         """
         camera = self.compared(settings, pose)
         if camera is None:
-            width, height = _frame_size(pose, COARSE if coarse else 1)
+            width, height = _choose_size(pose, COARSE if coarse else 1)
             view = free_view(width, height, pose.fov, pose.position, pose.wxyz, self.gaussians.get_xyz.device)
-            image, words = self._image(settings, view)
+            image, words = self._draw_image(settings, view)
             return Frame(to_bytes(image).numpy(), words._replace(warning=_NO_PHOTO if _needs_photo(settings) else ""))
         key = replace(settings, slider=0, comparison=views.ALONE), version
         if self._compared[0] != key:
-            target = as_float(camera.target(self._background(settings)))
-            drawn = self._image(settings, camera, target)
+            target = as_float(camera.target(self._make_background(settings)))
+            drawn = self._draw_image(settings, camera, target)
             if (counts := self.masks(camera)) is not None:
                 target = dim_masked(target, counts)
             self._compared = key, (target, *drawn)
         target, image, words = self._compared[1]
         if settings.comparison == views.BESIDE and settings.mode == views.COLOUR:
             words = ERROR_SCALE  # of the third image
-        shown = to_bytes(_fit_window(_compose(settings, target, image), pose)).numpy()
+        shown = to_bytes(_fit_window(_compose_panels(settings, target, image), pose)).numpy()
         return Frame(shown, words._replace(sides=_describe_sides(settings)))
 
     def surface(self, settings: Settings, pose: Pose, ray: np.ndarray) -> np.ndarray | None:
@@ -87,7 +92,7 @@ class Frames:
         Its depth is the median in the pixel that the ray goes through.
         """
         axes, place = rotation_matrix(pose.wxyz), np.array(pose.position)
-        width, height = _frame_size(pose)
+        width, height = _choose_size(pose)
         right, down, ahead = ray @ axes
         if ahead <= 0:
             return None
@@ -103,10 +108,12 @@ class Frames:
         camera = self._cameras.by_name.get(settings.camera)
         return camera if camera and _needs_photo(settings) and self._cameras.stands_at_camera(pose, camera) else None
 
-    def _background(self, settings: Settings) -> Tensor:
+    def _make_background(self, settings: Settings) -> Tensor:
         return self.gaussians.get_xyz.new_tensor(settings.background)
 
-    def _image(self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None) -> tuple[Tensor, Legend]:
+    def _draw_image(
+        self, settings: Settings, view: Camera | MiniCam, target: Tensor | None = None
+    ) -> tuple[Tensor, Legend]:
         """The mode's image (3, H, W) in [0, 1]. Without a target there is no error, and the colour is drawn."""
         part = select_shown(self.gaussians, settings, self.kept)
         if settings.mode == views.COUNT:
@@ -121,7 +128,7 @@ class Frames:
         options = {"want_depth": False, "want_visibility": False, "use_trained_exp": exposed}
         if coverage is not None:
             options["features"] = coverage.guesses(part.get_xyz, view.camera_center)
-        drawn = render(view, part, self._pipe, self._background(settings), settings.scaling, **options)
+        drawn = render(view, part, self._pipe, self._make_background(settings), settings.scaling, **options)
         colour = drawn["render"]
         if coverage is not None:
             return darken_guesses(colour, drawn["features"]), Legend()
@@ -130,7 +137,7 @@ class Frames:
         return colour, Legend()
 
 
-def _frame_size(pose: Pose, coarser: int = 1) -> tuple[int, int]:
+def _choose_size(pose: Pose, coarser: int = 1) -> tuple[int, int]:
     """The width and height of a frame, in pixels."""
     scale = min(1.0, LONGEST / max(pose.width, pose.height)) / coarser
     return max(1, round(pose.width * scale)), max(1, round(pose.height * scale))
@@ -141,7 +148,7 @@ def _needs_photo(settings: Settings) -> bool:
 
 
 def _describe_sides(settings: Settings) -> str:
-    """Say which image is where in the frame of `_compose`."""
+    """Say which image is where in the frame of `_compose_panels`."""
     shown = "render" if settings.mode == views.COLOUR else settings.mode.lower()
     error = ", error" if settings.mode == views.COLOUR else ""
     sides = {
@@ -151,7 +158,8 @@ def _describe_sides(settings: Settings) -> str:
     return sides.get(settings.comparison, "")
 
 
-def _compose(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
+def _compose_panels(settings: Settings, target: Tensor, image: Tensor) -> Tensor:
+    """Put the photo and the render into one frame, (3, H, W) each: side by side, or on either side of the slider."""
     if settings.comparison == views.ALONE:
         return image
     if settings.comparison == views.BESIDE:

@@ -35,6 +35,11 @@ class Frusta:
     """
 
     def __init__(self, cameras: SceneCameras, chosen: Callable[[Any, str], None], visible: bool) -> None:
+        """Prepare pyramids of the cameras, of many only some.
+
+        chosen: called with the event of a click and the name of the clicked camera.
+        visible: true if they are drawn at first.
+        """
         from viser.transforms import SO3
 
         names = list(cameras.by_name)
@@ -54,25 +59,26 @@ class Frusta:
         """Draw the cameras for a browser."""
         if not self.names:
             return
-        opacities = self._opacities(client.camera.position)
+        opacities = self._compute_opacities(client.camera.position)
         drawn = self._drawn[client.client_id] = client.scene.add_batched_meshes_simple(
             _NAME, _APEX_AND_CORNERS, _FACES, self._turns, self._places,
-            batched_scales=self._scales(opacities), batched_colors=self._colours, batched_opacities=opacities,
+            batched_scales=self._compute_scales(opacities), batched_colors=self._colours, batched_opacities=opacities,
             lod="off", wireframe=True, side="double", cast_shadow=False, receive_shadow=False, visible=self._visible,
         )  # fmt: skip
-        drawn.on_click(self._clicked)
+        drawn.on_click(self._take_click)
 
-    async def _clicked(self, event: Any) -> None:
+    async def _take_click(self, event: Any) -> None:
+        """Tell the page which camera was clicked."""
         if event.instance_index in range(len(self.names)):
             self._chosen(event, self.names[event.instance_index])
 
     def update_browser(self, client: "viser.ClientHandle") -> None:
         """Fade what is near the camera of a browser."""
         drawn = self._drawn.get(client.client_id)
-        opacities = self._opacities(client.camera.position)
+        opacities = self._compute_opacities(client.camera.position)
         if drawn is not None and not np.array_equal(opacities, drawn.batched_opacities):
             with client.atomic():
-                drawn.batched_opacities, drawn.batched_scales = opacities, self._scales(opacities)
+                drawn.batched_opacities, drawn.batched_scales = opacities, self._compute_scales(opacities)
 
     def remove_browser(self, client_id: int) -> None:
         """Forget a browser that has gone."""
@@ -84,9 +90,10 @@ class Frusta:
         for drawn in self._drawn.values():
             drawn.visible = visible
 
-    def _opacities(self, position: np.ndarray) -> np.ndarray:
+    def _compute_opacities(self, position: np.ndarray) -> np.ndarray:
+        """Return the opacity (N,) of each camera as seen from a position (3,): near ones fade."""
         return fade_opacities(np.linalg.norm(self._places - position, axis=1) / self._length).astype(np.float32)
 
-    def _scales(self, opacities: np.ndarray) -> np.ndarray:
+    def _compute_scales(self, opacities: np.ndarray) -> np.ndarray:
         """Sizes (N, 3); one that cannot be seen has none, so that no click meets it."""
         return np.where(opacities[:, None] > 0, self._sizes, 0.0).astype(np.float32)

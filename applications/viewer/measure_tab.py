@@ -35,11 +35,18 @@ class Place:
     """Files that keep a model's orientation. folder: of the model; scene: its folder, "" without one."""
 
     def __init__(self, folder: Path, scene: str, offset: tuple[float, float, float]) -> None:
+        """Read the records of the scale, upright and front that were set before.
+
+        folder: of the model.
+        scene: folder of the scene, "" without one.
+        offset: of the world in which the model is shown, (3,).
+        """
         self._folder, self._scene, self.offset = folder, scene, np.array(offset, np.float64)
         self.record: dict[str, Any] | None = recorded_similarity(str(folder), scene).get(ENTRY)
         of_scene = read_orientation(Path(scene)) if scene else None
         self._of_scene = bool(scene) and (of_scene is None or of_scene == self.record)
-        self.before: list[tuple[Any, list[tuple[Path, Any]]]] = []  # records before each `write`, as of `_put`
+        # Records before each `write`, as `_write_records` takes them.
+        self.before: list[tuple[Any, list[tuple[Path, Any]]]] = []
 
     @property
     def unit(self) -> tuple[float, str]:
@@ -53,13 +60,13 @@ class Place:
         if (self._folder / MODEL_JSON).is_file() or not records:
             records.append((self._folder / MODEL_JSON, read_model_json(self._folder).get(ENTRY)))
         self.before.append((self.record, records))
-        return self._put(record, [(path, record) for path, _ in records])
+        return self._write_records(record, [(path, record) for path, _ in records])
 
     def restore(self) -> list[Path]:
         """Put back what the last `write` replaced; the files."""
-        return self._put(*self.before.pop())
+        return self._write_records(*self.before.pop())
 
-    def _put(self, record: dict[str, Any] | None, records: list[tuple[Path, Any]]) -> list[Path]:
+    def _write_records(self, record: dict[str, Any] | None, records: list[tuple[Path, Any]]) -> list[Path]:
         """Write the records of files, None: without one. record: the one that counts from now on."""
         for path, entry in records:
             if path.name == MODEL_JSON:
@@ -91,6 +98,7 @@ class MeasureTab:
         report: Callable[[Any, str, list[Path]], None],
         refuse: Refuse,
     ) -> None:
+        """Put the controls into the current tab of the server."""
         gui, self._server, self._cameras, self._find, self._place = server.gui, server, cameras, find, place
         self.points: dict[str, list[np.ndarray]] = {tool: [] for tool in _POINTS}
         self._drawn: list[Any] = []
@@ -103,7 +111,7 @@ class MeasureTab:
         self.back = gui.add_button("As before", hint="take the last “Set right” back", color="gray", disabled=True)
         self.tool.on_update(serialize(lambda _: self._choose()))
         self.metres.on_update(serialize(lambda _: self._show()))
-        clear.on_click(serialize(lambda _: self._clear()))
+        clear.on_click(serialize(lambda _: self._clear_points()))
         self.keep.on_click(serialize(lambda event: report(event.client, "Set right", self.write()), refuse))
         self.back.on_click(serialize(lambda event: report(event.client, "As before", self.restore()), refuse))
 
@@ -111,10 +119,10 @@ class MeasureTab:
         """Listen to clicks while there is something to click."""
         self._server.scene.remove_click_callback("all")
         if self.tool.value != OFF:
-            self._server.scene.on_click()(self._clicked)
+            self._server.scene.on_click()(self._take_click)
         self._show()
 
-    async def _clicked(self, event: Any) -> None:
+    async def _take_click(self, event: Any) -> None:
         pose, tool = read_pose(event.client.camera), self.tool.value
         if pose is not None and tool in _POINTS:
             self._find(pose, np.array(event.ray_direction), lambda point: self.add(tool, point))
@@ -128,17 +136,18 @@ class MeasureTab:
         self.points[tool] = [*points, point] if len(points) < _POINTS[tool] else [point]
         self._show()
 
-    def _clear(self) -> None:
+    def _clear_points(self) -> None:
         self.points = {tool: [] for tool in _POINTS}
         self._show()
 
-    def _whole(self, tool: str) -> np.ndarray | None:
+    def _find_complete_points(self, tool: str) -> np.ndarray | None:
+        """Return the points (P, 3) that were clicked for a tool; None until there are as many as it needs."""
         return np.array(self.points[tool]) if len(self.points[tool]) == _POINTS[tool] else None
 
     @property
     def length(self) -> float | None:
         """Return the distance of the two points, in the scene's unit; None without them."""
-        ends = self._whole(LENGTH)
+        ends = self._find_complete_points(LENGTH)
         return None if ends is None else float(np.linalg.norm(ends[1] - ends[0]))
 
     def _show(self) -> None:
@@ -160,15 +169,15 @@ class MeasureTab:
             said = f"{self.length * scale:.4g} {unit}"
             self.says.content = f"The length is {said}. {self.says.content}"
             self._drawn.append(scene.add_label("/measured/length", said, position=np.mean(self.points[LENGTH], axis=0)))
-        if (ground := self._whole(GROUND)) is not None:
-            tilt = f"The ground is tilted by {self._tilt(ground):.1f} degrees in the photos."
+        if (ground := self._find_complete_points(GROUND)) is not None:
+            tilt = f"The ground is tilted by {self._measure_tilt(ground):.1f} degrees in the photos."
             self.says.content = f"{tilt} {self.says.content}"
         known = (self.length or 0) > 0 and self.metres.value > 0
-        whole = known or any(self._whole(tool) is not None for tool in (GROUND, FRONT))
+        whole = known or any(self._find_complete_points(tool) is not None for tool in (GROUND, FRONT))
         self.keep.disabled = self._place is None or not whole
         self.back.disabled = not (self._place and self._place.before)
 
-    def _tilt(self, ground: np.ndarray) -> float:
+    def _measure_tilt(self, ground: np.ndarray) -> float:
         """Degrees between what is up for the ground (3,3) and for the photos."""
         normal = ground_normal(ground)
         cosine = abs(normal @ self._cameras.vertical) / np.linalg.norm(normal).clip(1e-12)
@@ -180,7 +189,10 @@ class MeasureTab:
             raise UserError("there is nothing to set right; click the ground, the front, or a length that you know")
         metres = self.metres.value if math.isfinite(self.metres.value) else 0.0
         scale = metres / self.length if self.length and metres > 0 else None
-        moved = {tool: None if (it := self._whole(tool)) is None else it + self._place.offset for tool in _POINTS}
+        moved = {
+            tool: None if (it := self._find_complete_points(tool)) is None else it + self._place.offset
+            for tool in _POINTS
+        }
         above = self._cameras.middle + self._place.offset
         record = measured_record(self._place.record, above, scale, moved[GROUND], moved[FRONT])
         Similarity.read(record, "what was measured")  # a scale that no scene has

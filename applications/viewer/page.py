@@ -104,16 +104,20 @@ class Page:
         if untrained or scene.loaded_iter is not None:  # a model that trains moves
             place = None if oriented is None else Place(folder, oriented, gaussians.world_offset)
             with self.tabs.add_tab("Measure"):
-                self.measure = MeasureTab(self.server, self._cameras, self._find, place, self._report_set, self._refuse)
+                self.measure = MeasureTab(
+                    self.server, self._cameras, self._find_point, place, self._report_set, self._refuse
+                )
         self.path.saved.on_click(serialize(lambda event: self._save_path(event.client, folder), self._refuse))
         self.server.scene.set_up_direction(tuple(self._cameras.up.tolist()))
         self.server.initial_camera.near = 1e-3 * self._cameras.size
         self.server.initial_camera.far = 1e3 * self._cameras.size
-        self.server.on_client_connect(self._came)
-        self.server.on_client_disconnect(self._left)
+        self.server.on_client_connect(self._add_browser)
+        self.server.on_client_disconnect(self._remove_browser)
 
     # Coroutines, so that viser calls them one after the other: a browser that has left stays away.
-    async def _came(self, client: "viser.ClientHandle") -> None:
+    async def _add_browser(self, client: "viser.ClientHandle") -> None:
+        """Greet a browser: watch its camera, and draw a first frame for it."""
+
         async def moved(camera: "viser.CameraHandle") -> None:
             self.images.update_browser(client)
             pose = read_pose(camera)
@@ -126,7 +130,7 @@ class Page:
         await moved(client.camera)
         client.camera.on_update(moved)
 
-    async def _left(self, client: "viser.ClientHandle") -> None:
+    async def _remove_browser(self, client: "viser.ClientHandle") -> None:
         self.watchers.remove_browser(client.client_id)
         self.images.remove_browser(client.client_id)
         self._legends.pop(client.client_id, None)
@@ -148,14 +152,15 @@ class Page:
             image, legend = self.frames.draw(self.settings(), wish.pose, wish.coarse, version)
             client = self.server.get_clients().get(wish.client)
             if client is not None:  # it has not left
-                self._send(client, image, wish.coarse)
+                self._send_image(client, image, wish.coarse)
                 self._explain(wish.client, legend)
             self._faults.pop(wish.client, None)
         except Exception as error:  # memory, an image that is gone
             self._notify_fault(wish.client, first_line(error))
 
     @staticmethod
-    def _send(client: "viser.ClientHandle", image: np.ndarray, coarse: bool) -> None:
+    def _send_image(client: "viser.ClientHandle", image: np.ndarray, coarse: bool) -> None:
+        """Send an image (H, W, 3) uint8 to a browser. coarse: true for one of a moving camera."""
         if not coarse and max(image.shape) <= LONGEST // 2:
             image = image.repeat(2, axis=0).repeat(2, axis=1)  # JPEG halves the resolution of colours
         quality = _COARSE_QUALITY if coarse else _FULL_QUALITY
@@ -170,6 +175,7 @@ class Page:
             shown.content, shown.visible = text, bool(text)
 
     def _notify_fault(self, client: int, fault: str) -> None:
+        """Tell a browser, once, why its frame could not be drawn."""
         if fault != self._faults.get(client):
             self._faults[client] = fault
             tqdm.write(f"warning: the viewer could not draw a frame ({fault})", file=sys.stderr)
@@ -209,7 +215,13 @@ class Page:
             self.notify("Exported", f"{what}: {CROPS}/{file.name}{replaced}")
             name.suggest()
 
-    def _find(self, pose: Pose, ray: np.ndarray, found: Callable[[np.ndarray | None], None]) -> None:
+    def _find_point(self, pose: Pose, ray: np.ndarray, found: Callable[[np.ndarray | None], None]) -> None:
+        """Find the point on the surface along a ray from a pose, between two frames.
+
+        ray: (3,), in the world.
+        found: called with the point (3,), or None where there is no surface.
+        """
+
         def ask() -> None:
             point = None
             try:
@@ -221,11 +233,13 @@ class Page:
         self.requests.ask(ask)
 
     def _report_set(self, client: "viser.ClientHandle", what: str, files: list[Path]) -> None:
+        """Print and show which files a change of scale, upright or front was written into."""
         names = " and ".join(map(str, files))
         tqdm.write(as_utf8(f"{what}; written into {names}"), file=sys.stdout)
         self._notify(client, what, f"exports of this scene follow it from now on: {names}")
 
     def _save_path(self, client: "viser.ClientHandle", folder: Path) -> None:
+        """Save the camera path, and show how to make its video. folder: of the model."""
         replaced, file = self.path.file.replaced(), self.path.save()
         size = (max(2, side - side % 2) for side in read_window(client.camera))
         words = shlex.join(map(str, ("-m", folder, "--path", file, "--size", *size)))
@@ -256,7 +270,10 @@ def write_crop(path: Path, gaussians: GaussianModel, box: tuple[Vector, Vector],
 
 
 def serve(page: Page) -> type[KeyboardInterrupt] | None:
-    """Do what browsers ask for, until one of them closes the page or a signal comes; return the signal's exception."""
+    """Draw frames and do what buttons ask for, until a browser closes the page or Ctrl-C or SIGTERM comes.
+
+    Return the exception that the signal stands for; None if a browser closed the page.
+    """
     with DeferredInterrupt() as interrupt:
         while not interrupt.requested and not page.requests.stopped:
             answer(page)

@@ -31,6 +31,7 @@ class PathTab:
     """
 
     def __init__(self, server: "viser.ViserServer", folder: Path, cameras: SceneCameras, refuse: Refuse) -> None:
+        """Put the controls into the current tab of the server. folder: of the model, for saved paths."""
         gui, self._server, self._cameras = server.gui, server, cameras
         self.keyframes: list[Keyframe] = []
         self._playing: asyncio.Task | None = None
@@ -53,10 +54,10 @@ class PathTab:
         for button, call in zip(buttons, calls, strict=True):
             button.on_click(serialize(lambda event, call=call: call(event.client), refuse))
         self._of_one, self._of_two, self._of_file = (again, delete), (self.play, self.saved), opened
-        self._grey()
+        self._update_buttons()
         self.list_files()
 
-    def _grey(self) -> None:
+    def _update_buttons(self) -> None:
         """Let nobody press what needs keyframes that are not there."""
         for least, buttons in ((1, self._of_one), (2, self._of_two)):
             for button in buttons:
@@ -72,28 +73,28 @@ class PathTab:
         wait = min(max(self.seconds.value, 0.1), _LONGEST_WAIT)
         seconds = self.keyframes[-1].seconds + wait if self.keyframes else 0.0
         self.keyframes.append(Keyframe(round(seconds, 3), pose.position, pose.wxyz, math.degrees(pose.fov)))
-        self._list(len(self.keyframes) - 1)
+        self._list_keyframes(len(self.keyframes) - 1)
 
     def delete(self, client: "viser.ClientHandle") -> None:
         """Delete the chosen keyframe, and go to the one in its place.
 
         The others keep their times; if it was the first one, they all move, since a path begins at 0.
         """
-        index = self._index()
+        index = self._find_index()
         del self.keyframes[index]
         first = self.keyframes[0].seconds if self.keyframes else 0.0
         self.keyframes = [replace(key, seconds=round(key.seconds - first, 3)) for key in self.keyframes]
-        self._list(min(index, len(self.keyframes) - 1))
+        self._list_keyframes(min(index, len(self.keyframes) - 1))
         self.move_to_keyframe(client if self.keyframes else None)
 
-    def _list(self, index: int) -> None:
+    def _list_keyframes(self, index: int) -> None:
         """List the keyframes, and choose one."""
         names = tuple(f"{n}: at {key.seconds:g} s" for n, key in enumerate(self.keyframes, 1)) or (_NONE,)
         self.chosen.options = names
         self.chosen.value = names[max(index, 0)]
-        self._grey()
+        self._update_buttons()
 
-    def _index(self) -> int:
+    def _find_index(self) -> int:
         if not self.keyframes or self.chosen.value not in self.chosen.options:
             raise UserError("no keyframe is chosen; add a view, or choose one of the list")
         return self.chosen.options.index(self.chosen.value)
@@ -101,17 +102,17 @@ class PathTab:
     def move_to_keyframe(self, client: "viser.ClientHandle | None") -> None:
         """Move a browser's camera to the chosen keyframe. None: the list has changed by itself."""
         if client is not None:
-            self._move(client, self.keyframes[self._index()])
+            self._move_view(client, self.keyframes[self._find_index()])
 
-    def _move(self, client: "viser.ClientHandle", key: Keyframe) -> None:
+    def _move_view(self, client: "viser.ClientHandle", key: Keyframe) -> None:
         self._cameras.move(client, np.array(key.position), rotation_matrix(key.wxyz), math.radians(key.fov))
 
     def toggle_playing(self, client: "viser.ClientHandle") -> None:
         """Move a browser's camera along the path in real time, or stop if that is under way."""
         if self._playing is not None:
             return self.stop()
-        self._playing = asyncio.get_running_loop().create_task(self._play(client, KeyframePath(self.path())))
-        self._playing.add_done_callback(self._played)
+        self._playing = asyncio.get_running_loop().create_task(self._play_path(client, KeyframePath(self.path())))
+        self._playing.add_done_callback(self._end_playing)
         self.play.label = "Stop"
 
     def stop(self) -> None:
@@ -119,14 +120,15 @@ class PathTab:
         if playing := self._playing:
             playing.get_loop().call_soon_threadsafe(playing.cancel)
 
-    async def _play(self, client: "viser.ClientHandle", path: KeyframePath) -> None:
+    async def _play_path(self, client: "viser.ClientHandle", path: KeyframePath) -> None:
+        """Move a browser's view along the path, until its end or until the browser leaves."""
         began, seconds = time.perf_counter(), -1.0
         while seconds < path.seconds and client.client_id in self._server.get_clients():
             seconds = min(time.perf_counter() - began, path.seconds)
-            self._move(client, path.at(seconds))
+            self._move_view(client, path.at(seconds))
             await asyncio.sleep(_BETWEEN)
 
-    def _played(self, _: asyncio.Task) -> None:
+    def _end_playing(self, _: asyncio.Task) -> None:
         self._playing, self.play.label = None, "Play"
 
     def path(self) -> CameraPath:
@@ -155,5 +157,5 @@ class PathTab:
             raise UserError("there is no such path; save one first, or choose one of the list")
         self.file.field.value, path = name, read_camera_path(self.file.folder / f"{name}.json")
         self.keyframes, self.easing.value = list(path.keyframes), path.easing
-        self._list(0)
+        self._list_keyframes(0)
         self.move_to_keyframe(client)

@@ -33,6 +33,12 @@ class ImagesTab:
         all_drawn: bool,
         photos: bool,
     ) -> None:
+        """Put the controls into the current tab of the server.
+
+        changed: called when the picture changes, with true while the slider may go on moving.
+        all_drawn: true if pyramids of all cameras are drawn at first, and browsers begin with a view of all.
+        photos: true if the cameras have photos.
+        """
         gui, self._server, self._cameras, self._all_drawn = server.gui, server, cameras, all_drawn
         self.frusta = Frusta(cameras, self._choose, all_drawn)
         self._divider = Divider(cameras.size, self._drag)
@@ -47,19 +53,19 @@ class ImagesTab:
         shown = gui.add_checkbox("Draw cameras", all_drawn, hint="a click on one jumps there; those near the view fade")
         colours = gui.add_markdown("Training views are blue, test views orange.", visible=all_drawn)
         self._windows: dict[int, tuple[int, int]] = {}  # of browsers, to which their opening angles fit
-        self._begin()
+        self._set_beginning()
         # In turn, so that the view does not get its place from one camera and its direction from the next.
-        self.camera.on_update(serialize(lambda event: (self._begin(), self.move_to_camera(event.client))))
+        self.camera.on_update(serialize(lambda event: (self._set_beginning(), self.move_to_camera(event.client))))
         again.on_click(serialize(lambda event: self.move_to_camera(event.client)))
         self.comparison.on_update(serialize(lambda event: (self._compare(event.client), changed(False))))
-        self.slider.on_update(serialize(lambda _: (self._divide(), changed(True))))
+        self.slider.on_update(serialize(lambda _: (self._draw_divider(), changed(True))))
         shown.on_update(serialize(lambda _: (self.frusta.show(shown.value), setattr(colours, "visible", shown.value))))
 
     def read(self, settings: Settings) -> Settings:
         """Add the settings of these controls."""
         return replace(settings, camera=self.camera.value, comparison=self.comparison.value, slider=self.slider.value)
 
-    def _begin(self) -> None:
+    def _set_beginning(self) -> None:
         """Let browsers that come from now on begin at the chosen camera, or where all are in view."""
         camera, initial = self._cameras.by_name.get(self.camera.value), self._server.initial_camera
         if camera is None:
@@ -74,11 +80,11 @@ class ImagesTab:
 
     def update_browser(self, client: "viser.ClientHandle") -> None:
         """Follow a browser whose camera has moved, or whose window has another size."""
-        self._fit(client)
-        self._divide()
+        self._fit_angle(client)
+        self._draw_divider()
         self.frusta.update_browser(client)
 
-    def _fit(self, client: "viser.ClientHandle") -> None:
+    def _fit_angle(self, client: "viser.ClientHandle") -> None:
         """Fit the opening angle to a browser's window if that is new or has changed, and the camera has not moved."""
         camera, pose = self._cameras.by_name.get(self.camera.value), views.read_pose(client.camera)
         if camera is None or pose is None or not self._cameras.stands_at(pose, *self._beginning):
@@ -101,7 +107,7 @@ class ImagesTab:
         self._divider.remove_browser(client)
         self._windows.pop(client, None)
 
-    def _divide(self) -> None:
+    def _draw_divider(self) -> None:
         """Draw the line between photo and render for those who see both."""
         camera, slides = self._cameras.by_name.get(self.camera.value), self.comparison.value == views.SLIDER
         for client in self._server.get_clients().values():
@@ -116,7 +122,7 @@ class ImagesTab:
         self.slider.visible = self.comparison.value == views.SLIDER
         if self.comparison.value != views.ALONE:
             self.move_to_camera(client)
-        self._divide()
+        self._draw_divider()
 
     def move_to_camera(self, client: "viser.ClientHandle | None") -> None:
         """Move a browser's camera to the chosen one."""

@@ -33,7 +33,7 @@ def check_port(port: int | None) -> None:
         if not 0 <= port <= 65535:
             raise UserError(f"the page's port must be between 0 (any) and 65535, got {port}")
         _import_viser()
-        _free_port(port)
+        _find_free_port(port)
 
 
 def serve(port: int, label: str) -> tuple["viser.ViserServer", str]:
@@ -44,19 +44,19 @@ def serve(port: int, label: str) -> tuple["viser.ViserServer", str]:
     viser = _import_viser()
     # A browser may leave at any moment, also while a frame is drawn for it.
     warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
-    free = _free_port(port)
-    with _guarded(label) as started, contextlib.redirect_stdout(io.StringIO()):
+    free = _find_free_port(port)
+    with _guard_server(label) as started, contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(HOST, free, label=label, verbose=False)
     if not started:
         stop(server)
         raise UserError(f"this release of viser cannot be guarded; pip install {VISER}")
     server.gui.configure_theme(show_logo=False, show_share_button=False)
     server.gui.main_panel.dock_right()  # beside the picture, of which it would cover a third
-    return server, _announce(port, server.get_port())
+    return server, _announce_address(port, server.get_port())
 
 
 @contextlib.contextmanager
-def _guarded(title: str) -> Iterator[list[Any]]:
+def _guard_server(title: str) -> Iterator[list[Any]]:
     """Let a viser server that starts inside answer only requests that pass `is_own`. Yields the servers.
 
     title: of the document, which is called after viser.
@@ -66,7 +66,10 @@ def _guarded(title: str) -> Iterator[list[Any]]:
     plain, started = websocket_server.serve, []
 
     def serve(*arguments: Any, process_request: Callable[..., Any], **options: Any) -> Any:
+        """Start the server as websockets does, but with `answer` before its own handler."""
+
         def answer(connection: Any, request: "Request") -> Any:
+            """Refuse a request that is not the page's own, and give the document its title."""
             if not is_own(request):
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "this page is served to its own machine alone\n")
             request.headers.pop("Accept-Encoding", None)  # or the document comes compressed
@@ -105,6 +108,7 @@ def stop(server: "viser.ViserServer") -> None:
 
 
 def _import_viser() -> ModuleType:
+    """Import viser. UserError if it is not installed."""
     try:
         import viser
     except ImportError as error:
@@ -112,7 +116,7 @@ def _import_viser() -> ModuleType:
     return viser
 
 
-def _free_port(port: int) -> int:
+def _find_free_port(port: int) -> int:
     """The first port that can be listened at; 0 if any may be chosen. UserError if there is none."""
     for tried in range(port, min(port + _TRIED, 65536)):
         with socket.socket() as probe:
@@ -127,7 +131,7 @@ def _free_port(port: int) -> int:
     raise UserError(f"port {port} and those after it are taken; choose another one")
 
 
-def _announce(requested: int, port: int) -> str:
+def _announce_address(requested: int, port: int) -> str:
     """Print and return the address of the page."""
     from tqdm import tqdm  # the site reads the options of parts without it
 

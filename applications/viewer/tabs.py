@@ -25,9 +25,13 @@ Refuse = Callable[["viser.ClientHandle", UserError], None]
 
 
 def serialize(call: Callable[[Any], object], refuse: Refuse | None = None) -> Callable[[Any], Any]:
-    """Make a coroutine of a call: viser runs coroutines one after the other, but plain functions in many threads.
+    """Return a handler for a control that calls `call`, so that no two calls of handlers overlap.
 
-    refuse: called with the browser and a UserError of the call.
+    viser runs coroutines one after the other, but plain functions in many threads at once; so the handler is a
+    coroutine.
+
+    call: called with the event of the control.
+    refuse: called with the browser and a UserError of `call`; None: the error is raised.
     """
 
     async def called(event: Any) -> None:
@@ -46,10 +50,11 @@ class FileName:
 
     def __init__(self, server: "viser.ViserServer", folder: Path, first: str, ending: str) -> None:
         self.folder, self._first, self._ending = folder, first, ending
-        self._suggested = self._free()
+        self._suggested = self._find_free_name()
         self.field = server.gui.add_text("Name", self._suggested, hint="letters, digits, - and _")
 
-    def _free(self) -> str:
+    def _find_free_name(self) -> str:
+        """Return the first name with a number that no file of the folder has."""
         number = 1
         while (self.folder / f"{self._first}{number}{self._ending}").exists():
             number += 1
@@ -58,7 +63,7 @@ class FileName:
     def suggest(self) -> None:
         """Put the next free name in the place of the one that was suggested before, but not of one that was typed."""
         if self.field.value == self._suggested:
-            self.field.value = self._suggested = self._free()
+            self.field.value = self._suggested = self._find_free_name()
 
     def path(self) -> Path:
         """The file. UserError for a name that is none."""
@@ -96,6 +101,15 @@ class ViewTab:
         photos: bool,
         covered: bool,
     ) -> None:
+        """Put the controls into the current tab of the server.
+
+        changed: called when the picture changes.
+        export: called to write the Gaussians of the crop box.
+        folder: of the model.
+        positions: of the Gaussians, (N, 3).
+        background: RGB in [0, 1].
+        cleaned, photos, covered: true if the model has a cleaned part, photos, training views that cover it.
+        """
         gui, self._scene = server.gui, server.scene
         self.mode = gui.add_dropdown("Show", views.MODES if photos else views.MODES[: views.MODES.index(views.ERROR)])
         hint = "what no training photo shows from about this direction; there the model guesses"
@@ -125,13 +139,13 @@ class ViewTab:
         shown = *drawn, self.crop, *self.box
         self._first = [(handle, handle.value) for handle in shown]
         for handle in drawn:
-            handle.on_update(lambda _: (self._grey(), changed()))
+            handle.on_update(lambda _: (self._update_reset(), changed()))
         for handle in (self.crop, *self.box):
-            handle.on_update(serialize(lambda _: (self._show_box(), self._grey(), changed())))
+            handle.on_update(serialize(lambda _: (self._show_box(), self._update_reset(), changed())))
         written.on_click(lambda _: export())
         self.reset.on_click(serialize(lambda _: self._reset()))
 
-    def _grey(self) -> None:
+    def _update_reset(self) -> None:
         self.reset.disabled = all(handle.value == value for handle, value in self._first)
 
     def _reset(self) -> None:

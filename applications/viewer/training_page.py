@@ -43,6 +43,7 @@ class TrainingPage(Part):
         self._step: Iteration | None = None
 
     def due(self, at: Iteration) -> bool:
+        """Tell if a frame or a request of the page is to be done in this iteration; choose the frame."""
         self._wish = None
         if self._page.watchers.any:
             wish = self._page.watchers.next(at.iteration)
@@ -51,6 +52,7 @@ class TrainingPage(Part):
         return self._wish is not None or self._requests.any
 
     def stepped(self, at: Iteration) -> None:
+        """Do what is due, outside of the clock of the training, and show numbers now and then."""
         self._step = at
         if at.due and not at.stopping and (self._wish is not None or self._requests.any):
             with self._run.clock.paused("viewing"):
@@ -62,14 +64,14 @@ class TrainingPage(Part):
         if self._wish is not None:
             self._draw(self._wish, at.iteration)
         if self._requests.any and not at.last:
-            self._obey(at)
+            self._fulfil_requests(at)
 
     def _draw(self, wish: Wish, version: int) -> None:
         began = time.perf_counter()
         self._page.fulfil(wish, version)
         self.budget.note_frame(began, time.perf_counter() - began)
 
-    def _obey(self, at: Iteration) -> None:
+    def _fulfil_requests(self, at: Iteration) -> None:
         """Do what was asked for, and return when the training is to go on, or with `step.stopping` set."""
         run, requests = self._run, self._requests
         if requests.paused:
@@ -103,6 +105,7 @@ class TrainingPage(Part):
             self._page.notify("Saved", f"chkpnt{at.iteration}.pth")
 
     def _show_numbers(self, iteration: int, paused: bool = False) -> None:
+        """Show iteration, Gaussians, speed, time to go, loss and curve on the page."""
         run, now = self._run, time.perf_counter()
         _, before, seconds = self._numbers
         expected = run.schedule.expected
@@ -115,10 +118,10 @@ class TrainingPage(Part):
         took = run.clock.seconds - seconds
         speed = (iteration - before) / took if before and took > 0 else None
         subset = common_subset([run.rows])
-        left = self._left(iteration, speed)
+        left = self._guess_seconds_left(iteration, speed)
         self._tab.show(speed, left, run.losses.mean, rows_on(run.rows, subset), subset)
 
-    def _left(self, iteration: int, speed: float | None) -> float | None:
+    def _guess_seconds_left(self, iteration: int, speed: float | None) -> float | None:
         """Seconds of training to go; None: not known."""
         run = self._run
         if run.schedule.by_clock:
@@ -135,13 +138,13 @@ class TrainingPage(Part):
             self._page.notify("The training has stopped", "Its terminal says why, and how to resume it")
         else:
             saved = as_utf8(f"{run.scene.model_path}/chkpnt{self._step.iteration}.pth")
-            self._stay(f"stopped and saved as {saved}" if by_button else "complete")
+            self._stay_open(f"stopped and saved as {saved}" if by_button else "complete")
 
     def close(self) -> None:
         """Stop listening."""
         self._page.stop()
 
-    def _stay(self, how: str) -> None:
+    def _stay_open(self, how: str) -> None:
         """Serve the page until it is closed or a signal comes; all of the training is written by now."""
         run, step = self._run, self._step
         self._show_numbers(step.iteration)
@@ -158,6 +161,7 @@ class TrainingPage(Part):
         serve(self._page)
 
     def _show_saved(self, iteration: int) -> None:
+        """Show the model that was saved at the end of the training, in place of the one in memory."""
         run, path = self._run, saved_ply(self._run.scene.model_path, iteration)
         gaussians = read_model(path)
         if run.scene.halves:

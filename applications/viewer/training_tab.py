@@ -24,6 +24,7 @@ class Requests:
     """
 
     def __init__(self, asked: Callable[[], None]) -> None:
+        """Start without requests. asked: called when one is made."""
         self._asked, self._lock = asked, threading.RLock()
         self._steps = self._checkpoints = 0
         self._jobs: list[Callable[[], object]] = []
@@ -31,12 +32,14 @@ class Requests:
         self.any = False  # read without the lock, in every iteration of a training
 
     def _set(self, **values: object) -> None:
+        """Set attributes under the lock, and tell the page that something is asked for."""
         with self._lock:
             vars(self).update(values)
             self.any = self.paused or self._checkpoints > 0 or bool(self._jobs) or self.stopped
             self._asked()
 
-    def _take(self, name: str) -> bool:
+    def _take_request(self, name: str) -> bool:
+        """Count down the requests of a kind, if there are any; tell if there was one."""
         with self._lock:
             count = getattr(self, name)
             self._set(**{name: max(0, count - 1)})
@@ -70,11 +73,11 @@ class Requests:
 
     def take_step(self) -> bool:
         """Tell if a paused training may take one iteration; if so, the request counts as fulfilled."""
-        return self._take("_steps")
+        return self._take_request("_steps")
 
     def take_checkpoint(self) -> bool:
         """Tell if a checkpoint is to be saved; if so, the request counts as fulfilled."""
-        return self._take("_checkpoints")
+        return self._take_request("_checkpoints")
 
     def work(self) -> None:
         """Do what needs the model. Called by the thread that changes it."""
@@ -100,6 +103,7 @@ class TrainingTab:
     """Buttons that make requests; iterations a second, time to go, loss, and the error against time."""
 
     def __init__(self, server: "viser.ViserServer", requests: Requests) -> None:
+        """Put the controls into the current tab of the server."""
         gui = server.gui
         self._requests = requests
         self.speed = gui.add_text("Iterations per second", "", disabled=True)
@@ -121,8 +125,8 @@ class TrainingTab:
             visible=False,
         )
         self._rows = 0
-        self.pause.on_click(serialize(lambda _: self._turn()))
-        step.on_click(serialize(lambda _: (requests.step(), self._label())))
+        self.pause.on_click(serialize(lambda _: self._toggle_pause()))
+        step.on_click(serialize(lambda _: (requests.step(), self._update_label())))
         save.on_click(lambda _: requests.save())
         for end in (stop, self.close):
             end.on_click(lambda _: requests.stop())
@@ -130,13 +134,13 @@ class TrainingTab:
     def begin_paused(self) -> None:
         """Let the training wait after its first iteration."""
         self._requests.pause()
-        self._label()
+        self._update_label()
 
-    def _turn(self) -> None:
+    def _toggle_pause(self) -> None:
         (self._requests.resume if self._requests.paused else self._requests.pause)()
-        self._label()
+        self._update_label()
 
-    def _label(self) -> None:
+    def _update_label(self) -> None:
         self.pause.label = "Resume" if self._requests.paused else "Pause"
 
     def show(

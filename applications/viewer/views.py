@@ -93,6 +93,7 @@ class SceneCameras:
     """
 
     def __init__(self, train: Sequence[Camera], test: Sequence[Camera]) -> None:
+        """Index the cameras of the training and the test set, and find start, middle and size of the scene."""
         self.by_name: dict[str, Camera] = {
             as_utf8(f"{of_set} {index}: {camera.image_name}"): camera
             for of_set, cameras in (("train", train), ("test", test))

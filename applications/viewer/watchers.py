@@ -111,12 +111,17 @@ class Watchers:
         """
         now = self._clock()
         with self._changed:
-            wishes = [(w.drawn, self._wish(client, w, now, version)) for client, w in self._watchers.items()]
+            wishes = [(w.drawn, self._make_wish(client, w, now, version)) for client, w in self._watchers.items()]
         wishes = [(not wish.urgent, drawn, wish.client, wish) for drawn, wish in wishes if wish is not None]
         return min(wishes)[-1] if wishes else None
 
     @staticmethod
-    def _wish(client: int, watcher: Watcher, now: float, version: int) -> Wish | None:
+    def _make_wish(client: int, watcher: Watcher, now: float, version: int) -> Wish | None:
+        """Return the frame that a browser needs now, or None.
+
+        now: seconds of the clock.
+        version: of the model.
+        """
         moving = now - watcher.moved < STILL_AFTER
         urgent = watcher.asked or not (moving or watcher.sharp)
         if urgent or not moving and watcher.version != version:

@@ -385,7 +385,7 @@ def test_clicked_points_measure_and_are_kept_as_the_scenes_orientation(tmp_path,
         with pytest.raises(UserError, match="nothing to set right"):
             tab.write()
         page.frames.surface = None
-        page._find(None, places[0], lambda point: tab.add("A length", point))  # as on a full GPU
+        page._find_point(None, places[0], lambda point: tab.add("A length", point))  # as on a full GPU
         answer(page)
         assert "There is no surface" in tab.says.content and client.until("NotificationShowMessage")["props"]["title"]
         del page.frames.surface
