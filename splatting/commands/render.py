@@ -24,7 +24,6 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
@@ -33,6 +32,7 @@ import torch
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.camera_paths.render_path import add_path_options, path_request, render_path
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, saved_scene, warn_if_moved
 from gaussian_renderer.memory_errors import explain_memory_errors
 from gaussian_renderer.rays import check_views
 from gaussian_renderer.scored_views import ScoredViews, extra_test_views
@@ -56,9 +56,6 @@ from scene.with_splats import load_file
 from splatting.records.renders import BESIDE, DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
 from utils.general_utils import safe_state
 from utils.system_utils import UserError, compute_device, mkdir_p
-
-if TYPE_CHECKING:
-    from gaussian_renderer.camera_paths.without_scene import WithoutScene
 
 _COMPARED, _FEWEST, _SMALL = 24, 6, (32, 32)  # most and fewest views that are compared, and their size in pixels
 _BETTER, _FITTING = 0.9, 0.75  # shares: of other photos that are less like a render than its own, and of such renders
@@ -254,8 +251,6 @@ def _loaded(
     views = *scene.getTrainCameras(), *scene.getTestCameras()
     check_views(pipeline, views)
     if not (ply or getattr(dataset, "other_scene", "")):
-        from gaussian_renderer.camera_paths.without_scene import warn_if_moved  # SciPy takes a while to import
-
         warn_if_moved(scene.model_path, views)
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
 
@@ -313,11 +308,9 @@ def main() -> None:
     warn_of_background(options)
     request = path_request(args)
     if request:
-        from gaussian_renderer.camera_paths.without_scene import saved_scene  # as above
-
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
         if request.make is None:
-            from gaussian_renderer.camera_paths.from_above import render_top  # as above
+            from gaussian_renderer.camera_paths.from_above import render_top  # rarely needed
 
             render_top(scene, options.source_path, pipeline, background, request.size)
         else:
