@@ -10,9 +10,14 @@ from groundwork.host.errors import UserError
 VIEWER_PORT = 8080  # of view.py, and of train.py --viewer
 
 
+def has_application(name: str) -> bool:
+    """Tell if applications/NAME is there."""
+    return find_spec("applications") is not None and find_spec(f"applications.{name}") is not None
+
+
 def application(name: str, module: str) -> ModuleType:
     """Import applications/NAME/MODULE.py. UserError if that application was deleted."""
-    if find_spec("applications") is None or find_spec(f"applications.{name}") is None:
+    if not has_application(name):
         raise UserError(f"this needs applications/{name}, which is not there; restore that folder of the repository")
     return import_module(f"applications.{name}.{module}")
 

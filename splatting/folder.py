@@ -14,6 +14,7 @@ from pathlib import Path
 from zipfile import is_zipfile
 
 from arguments import OPTIONS, VIEW_OPTIONS, other_scene, read_training_options
+from groundwork.applications import has_application
 from groundwork.files.folders import locked, remove_temporary_files
 from groundwork.files.json_files import ENLARGEMENT, SCHEDULE, read_model_json
 from groundwork.host import torchrun
@@ -48,13 +49,14 @@ def folder_of(checkpoint: str | None) -> str | None:
 
 
 def view_command(model_path: str, iteration: int | None = None) -> str:
-    """Return the command that shows a model.
+    """Return the command that shows a model, or renders it where there is no viewer.
 
     iteration: None, the newest one.
     """
     older = iteration is not None and max(saves_in(Path(model_path)), default=iteration) > iteration
     which = f" --iteration {iteration}" if older else ""
-    return f"{typed_command('view.py')} -m {shlex.quote(model_path)}{which}"
+    script = "view.py" if has_application("viewer") else "render.py"
+    return f"{typed_command(script)} -m {shlex.quote(model_path)}{which}"
 
 
 @contextlib.contextmanager

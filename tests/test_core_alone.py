@@ -1,9 +1,11 @@
 """The core without applications and benchmarks, which may be deleted."""
 
+import ast
 import os
 import shutil
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -66,3 +68,34 @@ def test_photos_without_cameras_need_an_application(alone, tmp_path):
     (tmp_path / "a.jpg").touch()
     done = _run(alone, "train.py", "-s", tmp_path, "-m", tmp_path / "out")
     assert done.returncode == 2 and "this needs applications/convert" in done.stderr
+
+
+@cache
+def _imports(path: Path) -> tuple[set[str], set[Path]]:
+    """Find the rooms of DELETED, and the helpers of tests, that a file imports outside of functions."""
+    names, nodes = set(), [ast.parse(path.read_text(encoding="utf-8"))]
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+        for_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        nodes += [] if for_types or isinstance(node, ast.FunctionDef) else ast.iter_child_nodes(node)
+    parts = [name.split(".") for name in names]
+    rooms = {".".join(part[: 1 if part[0] == "benchmarks" else 2]) for part in parts if part[0] in DELETED}
+    rooms |= {f"applications.{COMMANDS[part[0]]}" for part in parts if part[0] in COMMANDS}
+    helpers = [part[1:] if part[0] == "tests" else part for part in parts]
+    files = {ROOT.joinpath("tests", *part[:n]).with_suffix(".py") for part in helpers for n in (1, 2)}
+    return rooms, {file for file in files if file.is_file()}
+
+
+def test_a_test_is_left_out_with_each_application_that_it_imports(request):
+    """conftest.py looks at a test and its helpers. That the core imports no application, tests/test_house.py checks."""
+    rooms_of = request.config.pluginmanager.get_plugin(str(ROOT / "conftest.py"))._rooms
+    for test in (*ROOT.glob("tests/**/test_*.py"), *ROOT.glob("applications/*/tests/test_*.py")):
+        files, rooms = [test], set()
+        for file in files:
+            found, others = _imports(file)
+            rooms |= found
+            files += others - {*files}
+        assert rooms <= rooms_of(test), test

@@ -599,6 +599,7 @@ def test_an_orthographic_image_does_not_depend_on_depth(dtype):
         ),
         ({"colors": torch.zeros(60, 16, 3, dtype=DOUBLE)}, r"colors must be \(..., 60, D\), got \(60, 16, 3\)"),
         ({"backgrounds": torch.zeros(1, 3, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(1, 3\)"),
+        ({"backgrounds": torch.zeros(2, 4, dtype=DOUBLE)}, r"backgrounds must be \(2, 3\), got \(2, 4\)"),
         ({"viewmats": torch.eye(4, dtype=DOUBLE)}, r"viewmats must be \(1, 4, 4\), got \(4, 4\)"),
         (
             {"viewmats": torch.eye(4).repeat(CAMERAS, 1, 1)},

@@ -146,6 +146,13 @@ def test_utils_has_the_names_of_the_reference_at_its_top():
     assert {path.stem for path in (ROOT / "utils").glob("*.py")} - {"__init__"} == UTILS
 
 
+def test_an_application_imports_no_other():
+    """It calls another by groundwork/applications.py, as the other may be deleted."""
+    for path in (path for path in _python() if "applications" in path.relative_to(ROOT).parts):
+        own = ".".join(path.relative_to(ROOT).parts[:2])
+        assert [name for name in _imports(path) if _within(name, "applications") and not _within(name, own)] == [], path
+
+
 def test_functions_are_short_in_python():
     long = {
         f"{_module(path)}.{node.name}": length
@@ -178,6 +185,61 @@ def test_functions_are_short_in_c_plus_plus():
                 lengths[f"{path.relative_to(CSRC)}:{line}"] = match[0].count("\n") + 1
     assert len(lengths) > 250
     assert not {place: length for place, length in lengths.items() if length > LONGEST}
+
+
+# What no feature can pay with: growth goes into applications. Lines are lines of code.
+CEILINGS = {
+    "lines of the day's list": 6_900,
+    "files of the day's list": 55,
+    "lines of an iteration": 900,
+    "files of an iteration": 6,
+    "imports of an iteration beside the day's list": 30,
+    "lines of the core": 39_000,
+}
+NO_CORE = {"applications", "benchmarks", "tests", "emulation"}
+
+
+def _code_lines(path: Path) -> int:
+    """Count the lines that are not blank, comment or docstring."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".py":
+        text = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+        return sum(bool(re.sub(r"//.*", "", line).strip()) for line in text.splitlines())
+    lines = {n for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.lstrip().startswith("#")}
+    for node in ast.walk(_tree(path)):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node, clean=False):
+            lines -= {*range(node.body[0].lineno, node.body[0].end_lineno + 1)}
+    return len(lines)
+
+
+def _day() -> list[dict[Path, int]]:
+    """Read the groups of files of the day's list, with the lines that it states. The first group is an iteration."""
+    page = (ROOT / "docs/inside/architecture.md").read_text(encoding="utf-8")
+    groups = re.split(r"^ *[\d,]+  [A-Z].*$", page.partition("## The day's list")[2], flags=re.MULTILINE)[1:]
+    found = [re.findall(r"^ *(\d+)    (\S+\.py) ", group, re.MULTILINE) for group in groups]
+    return [{ROOT / name: int(lines) for lines, name in group} for group in found]
+
+
+def test_the_core_does_not_grow():
+    iteration, *others = map(list, _day())
+    day = [path for group in (iteration, *others) for path in group]
+    beside = {name for path in iteration for name in _imports(path, types=False)} - {*map(_module, day)}
+    core = [path for path in (*_python(), *_csrc()) if not NO_CORE & set(path.relative_to(ROOT).parts)]
+    measured = {
+        "lines of the day's list": sum(map(_code_lines, day)),
+        "files of the day's list": len(day),
+        "lines of an iteration": sum(map(_code_lines, iteration)),
+        "files of an iteration": len(iteration),
+        "imports of an iteration beside the day's list": len(beside),
+        "lines of the core": sum(map(_code_lines, core)),
+    }
+    assert not {what: f"{count}, above {CEILINGS[what]}" for what, count in measured.items() if count > CEILINGS[what]}
+
+
+def test_the_list_of_the_day_states_the_lines_of_its_files():
+    stated = {path: lines for group in _day() for path, lines in group.items()}
+    found = {path: _code_lines(path) for path in stated}
+    assert not {path.name: lines for path, lines in found.items() if abs(lines - stated[path]) > 20}
 
 
 def _includes(path: Path) -> list[str]:
@@ -225,6 +287,10 @@ def test_nothing_needs_the_function_of_gsplat():
     words = re.compile(r"diff_gaussian_rasterization\.gsplat|\b(?:OPERATORS|ops)\.(?:describe\w*|pinhole)\b")
     for path in (path for path in _python() if not {"gsplat", "benchmarks"} & set(path.parts)):
         assert not words.search(path.read_text(encoding="utf-8")), path
+    removed = (RASTERIZER / "csrc" / "README.md").read_text(encoding="utf-8").partition("## Without gsplat's")[2]
+    for path in (*ROOT.glob("tests/**/*.py"), *ROOT.glob("benchmarks/**/*.py")):
+        if words.search(path.read_text(encoding="utf-8")):
+            assert path.name in removed or path == Path(__file__), f"csrc/README.md does not say that {path} uses it"
 
 
 def test_tensors_are_seen_in_one_folder():

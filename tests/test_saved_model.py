@@ -16,6 +16,7 @@ import render
 from groundwork.host.start import typed_command
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
 from scene.saved_model import find_save, read_model
+from splatting.folder import view_command
 from splatting.iteration import Iteration
 from utils.system_utils import UserError
 
@@ -98,6 +99,8 @@ def test_an_interrupted_training_can_be_looked_at(colmap_scene, tmp_path, monkey
         monkeypatch.setattr("sys.argv", ["command", "-m", str(tmp_path), "--quiet", *map(str, words)])
         command.main()
     assert list((tmp_path / "test/ours_20/renders").iterdir()) and (tmp_path / "a.splat").stat().st_size > 1000
+    monkeypatch.setattr("splatting.folder.has_application", lambda name: False)
+    assert view_command("out").endswith("render.py -m out")
 
 
 def test_the_example_of_the_renderers_page(colmap_scene, tmp_path, monkeypatch):

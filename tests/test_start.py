@@ -98,9 +98,11 @@ def test_the_command_that_a_person_types(monkeypatch, tmp_path):
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "bin x" / "python"))
     assert typed_command("view.py") == f"'{tmp_path}/bin x/python' view.py"
+    assert typed_command("-m scene.export_world") == f"'{tmp_path}/bin x/python' -m scene.export_world"
     monkeypatch.chdir(tmp_path)
     assert typed_command("view.py") == f"'bin x/python' {ROOT}/view.py"
     monkeypatch.setattr("shutil.which", lambda *_, **__: sys.executable)
     assert typed_command("view.py") == f"python {ROOT}/view.py"
     monkeypatch.chdir("/")
     assert typed_command("view.py") == f"python {ROOT}/view.py"
+    assert typed_command("-m scene.export_world") == f"PYTHONPATH={ROOT} python -m scene.export_world"

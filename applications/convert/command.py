@@ -40,7 +40,7 @@ from applications.convert.programs import refuse_while_working
 from applications.convert.report import describe_lenses, record_inputs, summarise
 from applications.convert.video import FRAMES_MISSING, NOTE, describe_videos, list_report_entries, list_taken_frames
 from arguments import OptionParser
-from groundwork.host.listing import some
+from groundwork.host.listing import counted, some
 from groundwork.host.start import typed_command
 from scene.checks.conversion import awaits_conversion, file_state, read_stages
 from scene.readers.scene_folder import WORK, find_capture, is_scene
@@ -124,7 +124,8 @@ def _print_outcome(layout: Layout, found: Inputs, adding: bool) -> None:
     )
     print(f"Report: {layout.page}")
     if found.unused:
-        print(f"{len(found.unused)} files in {layout.input.name} were not used; {layout.report.name} has the reasons")
+        unused = counted(len(found.unused), "file")
+        print(f"{unused} in {layout.input.name} not used; {layout.report.name} has the reasons")
     if adding:
         print(describe_added(layout, report["left_out"]))
     for line in notes:

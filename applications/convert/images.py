@@ -100,11 +100,17 @@ def find_panoramas(folder: Path, names: Sequence[str]) -> tuple[list[str], list[
     return wide, marked
 
 
-def find_shared_pixels(folder: Path, names: Sequence[str], masks: Mapping[str, Path]) -> list[Finding]:
-    """Find pixels that nearly all photos in a folder share. masks: files by a photo's name."""
+def find_shared_pixels(
+    folder: Path, names: Sequence[str], masks: Mapping[str, Path], place: Path | None = None
+) -> list[Finding]:
+    """Find pixels that nearly all photos in a folder share.
+
+    masks: files by a photo's name.
+    place: the user's folder of these photos, if that is another.
+    """
     given = {name: Mask(path) for name, path in masks.items() if path.is_file()}
     photos = [Photo(name, folder / name, given.get(name)) for name in names]
-    return [*check_shared(looks_at(photos, _COMPARED))]
+    return [*check_shared(looks_at(photos, _COMPARED), place or folder)]
 
 
 def find_masks(names: Sequence[str], folder: Path, photos: Path) -> dict[str, Path]:

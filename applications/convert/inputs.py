@@ -13,7 +13,7 @@ from PIL import Image
 from groundwork.files.color_tags import HDR, code_points
 from groundwork.files.image_files import HEIF_SUFFIXES, RAW_SUFFIXES, SUFFIXES, UNREADABLE, VIDEO_SUFFIXES, open_image
 from groundwork.files.plain_files import describe_wrong_file, plain_path
-from groundwork.host.listing import some
+from groundwork.host.listing import counted, some
 from scene.images.decode import picture_size
 from utils.system_utils import UserError
 
@@ -65,8 +65,8 @@ def sort_inputs(folder: Path, skip_unreadable: bool = False, but: Iterable[Path]
     if unreadable:
         listed = "; ".join(f"{some(names)} ({reason})" for reason, names in unreadable.items())
         raise UserError(
-            f"{sum(map(len, unreadable.values()))} photos in {folder} cannot be read: {listed}; follow these hints, or "
-            "pass --skip_unreadable to convert.py, which leaves them out"
+            f"{counted(sum(map(len, unreadable.values())), 'photo')} in {folder} cannot be read: {listed}; follow "
+            "these hints, or pass --skip_unreadable to convert.py, which leaves them out"
         )
     return Inputs(sorted(photos), unused)
 

@@ -4,6 +4,7 @@ If this process is killed, it cannot end them. worker.py notices, because its in
 working, and keep the lock on the log that they write to.
 """
 
+import contextlib
 import fcntl
 import os
 import subprocess
@@ -94,12 +95,13 @@ def _run(command: Sequence[str], output: BinaryIO, look: Callable[[], None]) -> 
             raise UserError(f"cannot run {command[0]} ({error.strerror}); pass the program's full path") from error
         try:
             while True:
-                try:
-                    return process.wait(timeout=0.1)
-                except subprocess.TimeoutExpired:
-                    look()
-                if interrupt.requested:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    process.wait(timeout=0.1)
+                if interrupt.requested:  # before the status, since a signal to the group ends the program, too
                     raise interrupt.requested
+                if process.returncode is not None:
+                    return process.returncode
+                look()
         finally:
             _end(process)
             process.stdin.close()

@@ -263,7 +263,7 @@ def undistortion_stage(layout: Layout, settings: Settings, record: StageRecord, 
         # Patches could lie where masks leave photos out.
         more = 0 if layout.masks.is_dir() else add_points(layout.undistorted, shared, settings.no_gpu)
         masks = {name: layout.masks / f"{name}.png" for name in names}
-        if same := images.find_shared_pixels(root, names, masks):  # which other weaknesses come from
+        if same := images.find_shared_pixels(root, names, masks, layout.input):  # which other weaknesses come from
             found += same
         elif not given:
             found += check_reconstruction(

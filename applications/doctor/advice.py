@@ -105,13 +105,14 @@ def _filter_advice(advice: Finding, args: argparse.Namespace, given: Sequence[st
     return advice._replace(options="") if against or advice.options.startswith(names) else advice
 
 
-def check_options(source: str, images: str, model: str | None = None) -> list[Finding]:
+def check_options(source: str, images: str, model: str | None = None, masks: str = "") -> list[Finding]:
     """Notes of doctor.py on options that a scene asks for; none where it cannot be read.
 
-    images: as train.py's -i. model: folder of a model; what it was trained with is not asked for.
+    images, masks: as train.py's. model: folder of a model; what it was trained with is not asked for.
     """
     then = _read_trained_options(model) if model else []
-    dataset = ModelParams(argparse.ArgumentParser()).extract(argparse.Namespace(source_path=source, images=images))
+    given = argparse.Namespace(source_path=source, images=images, masks=masks)
+    dataset = ModelParams(argparse.ArgumentParser()).extract(given)
     dataset.lenses = "native"
     try:
         found = [*advise(dataset, trains=False)]

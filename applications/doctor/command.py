@@ -12,13 +12,14 @@ from pathlib import Path
 from applications.doctor import environment
 from arguments import OptionParser
 from groundwork.finding import Finding
+from groundwork.host.listing import counted
 
 
-def diagnose(source: str | None, images: str | None, model: str | None, iteration: int) -> int:
+def diagnose(source: str | None, images: str | None, model: str | None, iteration: int, masks: str = "") -> int:
     """Print the lines of the checks and return the number of problems.
 
     source, model: folders to check, or None. With both, the model is checked against that scene. images: folder of the
-    photos, None: `images`, and for a model the one that it was trained on.
+    photos, None: `images`, and for a model the one that it was trained on. masks: of the source, as train.py's --masks.
     """
     lines = environment.check_packages()
     complete = not any(one.is_problem for one in lines)
@@ -43,9 +44,11 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
     if source is not None:
         from applications.doctor.advice import check_options
         from scene.checks.scene import check_dataset
+        from scene.images.masks import MaskOptions
 
         names = source, images or "images"
-        problems += _show(f"dataset {source}", [*check_dataset(*names), *check_options(*names, model)])
+        found = [*check_dataset(*names, MaskOptions(masks)), *check_options(*names, model, masks)]
+        problems += _show(f"dataset {source}", found)
     if model is not None:
         from applications.doctor.model import check_model
 
@@ -70,11 +73,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         help="model folder to check, without -s with the scene that it was trained on (default: none)")  # fmt: skip
     add("-i", "--images", default=None,
         help="folder of the photos inside the scene folder (default: images, or that of the model)")  # fmt: skip
+    add("--masks", default="", metavar="FOLDER",
+        help="mask files of SCENE, as for train.py; a model has its own (default: those that SCENE names)")  # fmt: skip
     add("--iteration", type=int, default=-1, help="saved iteration of the model (default: the last)")
     args = parser.parse_args(argv)
-    problems = diagnose(args.source_path, args.images, args.model_path, args.iteration)
+    problems = diagnose(args.source_path, args.images, args.model_path, args.iteration, args.masks)
     if problems:
-        print(f"{problems} problem{'s' if problems > 1 else ''}")
+        print(counted(problems, "problem"))
         sys.exit(1)
     print("no problems found: ready")
 

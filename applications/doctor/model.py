@@ -20,6 +20,7 @@ from scene import Scene
 from scene.cameras import Camera
 from scene.checks.scene import check_dataset
 from scene.gaussian_model import GaussianModel
+from scene.images.masks import AUTO, MaskOptions
 from scene.images.sizes import training_size
 from scene.readers.info import CameraInfo, photo_size
 from scene.saved_model import load_saved
@@ -226,7 +227,8 @@ def _suggest_remedy(scene: Scene, stored: dict[str, Any], is_black: bool) -> str
     """Say what to check where renders are bad and nothing has changed since the training."""
     if not is_black and scene.loaded_iter < FEW_ITERATIONS:
         return f"train longer, {FEW_ITERATIONS} iterations at least"
-    dataset = check_dataset(stored.get("source_path", ""), stored.get("images", "images"))
+    masks = MaskOptions(stored.get("masks", ""), stored.get("invert_masks", False), stored.get("mask_meaning", AUTO))
+    dataset = check_dataset(stored.get("source_path", ""), stored.get("images", "images"), masks)
     if problem := next((line for line in dataset if line.is_problem), None):
         return f"the dataset has problems ({problem.text}): {problem.remedy}"
     return "check the poses (x right, y down, z forward), and whether scene (-s) and photos are those of the model"

@@ -22,7 +22,7 @@ import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
 
-from applications.export.formats import FORMATS, Format, SceneInputs, find_format
+from applications.export.formats import ENDINGS, FORMATS, Format, SceneInputs, find_format
 from applications.export.notes import read_notes
 from applications.export.reading import ANY, read_any
 from applications.export.upright import add_upright_options, check_upright, follows_scene, move_upright
@@ -305,9 +305,8 @@ def options() -> tuple[argparse.ArgumentParser, ModelParams, PipelineParams]:
     model_params = ModelParams(parser, sentinel=True, without=without)
     pipeline_params = PipelineParams(parser, sentinel=True)
     add = parser.add_argument
-    endings = "; ".join(f"{entry.ending}: {entry.what}" for entry in FORMATS)
     add("--to", required=True, action="append", metavar="FILE",
-        help=f"file to write; its ending is the format. May be given again, for several files. {endings}")  # fmt: skip
+        help=f"file to write; its ending is the format. May be given again, for several files. {ENDINGS}")  # fmt: skip
     add("file", nargs="?", default="", metavar="MODEL", help=f"write this model, of any tool, without a scene: {ANY}")
     add("--iteration", type=int, default=-1, help="saved iteration to write (default: -1, the last)")
     add(

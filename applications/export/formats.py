@@ -163,7 +163,7 @@ FORMATS = (
     _mesh_format("mesh.obj", write_obj_mesh, "the same, with .mtl and .png beside it", check_obj_mesh),
     _mesh_format("mesh.usdz", write_usdz_mesh, "the same, as OpenUSD", check_usdz_mesh),
     Format(".compressed.ply", write_compressed_ply, "PlayCanvas, SuperSplat"),
-    Format(".ply", write_plain_ply, "float32, everything kept", in_order=True),
+    Format(".ply", write_plain_ply, "Gaussians in float32, everything kept", in_order=True),
     Format(".splat", write_splat, "antimatter15, 32 bytes a splat, no SH bands", bands=False),
     Format(".spz", write_spz, "Niantic, version 4, or 3 or 2", options=("spz_version",), check=find_zstandard),
     Format(".sog", write_sog, "PlayCanvas, through splat-transform", check=find_splat_transform),
@@ -193,6 +193,8 @@ FORMATS = (
     ),
 )
 
+ENDINGS = ", ".join(f"{entry.ending} ({entry.what})" for entry in FORMATS)
+
 
 def find_format(path: str | os.PathLike) -> Format:
     """The format of a file's name. UserError for an ending that is none of the table's."""
@@ -200,5 +202,4 @@ def find_format(path: str | os.PathLike) -> Format:
     for entry in FORMATS:
         if name.endswith(entry.ending):
             return entry
-    endings = ", ".join(entry.ending for entry in FORMATS)
-    raise UserError(f"the format of {path} is unknown; end its name with one of {endings}")
+    raise UserError(f"the format of {path} is unknown; end its name with one of {ENDINGS}")

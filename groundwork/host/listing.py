@@ -11,6 +11,11 @@ def some(names: Sequence[str], most: int = 5) -> str:
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
 
 
+def counted(count: int, noun: str) -> str:
+    """A number with its noun, in the plural unless the number is 1."""
+    return f"{count} {noun}{'s' if count != 1 else ''}"
+
+
 def as_utf8(text: str) -> str:
     """Make a text printable: bytes of a file's name that are not UTF-8 become numbers, `\\udcff`."""
     return text.encode("utf-8", "backslashreplace").decode()

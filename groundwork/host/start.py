@@ -127,9 +127,15 @@ def _make_context() -> None:
 
 
 def typed_command(script: str) -> str:
-    """The command line of a script as typed in the current folder: this Python (python, if that is it) and the path."""
+    """The command line of a script, or of `-m MODULE`, as typed in the current folder, with this Python.
+
+    The latter is called python, if that is it.
+    """
     found, own = find_program("python"), Path(sys.executable)
     python = "python" if found and Path(found).absolute() == own.absolute() else _typed(own)
+    if script.startswith("-m "):
+        place = "" if Path.cwd() == _ROOT else f"PYTHONPATH={_typed(_ROOT)} "
+        return f"{place}{python} {script}"
     return f"{python} {_typed(_ROOT / script)}"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from groundwork.finding import Finding, Severity, fine
-from groundwork.host.listing import some
+from groundwork.host.listing import counted, some
 from scene.images.exif import read_lens
 from scene.readers.info import (
     APART,
@@ -152,11 +152,11 @@ def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
         view, angle = examples[unit]
         example = f"{view.image_name}: {angle:.1f} degrees, a focal length of {view.fx:.4g} pixels"
         remedy = f"give focal lengths in pixels (these may be in {unit}), or check the size of the photos"
-        yield Finding(f"{count} cameras have odd opening angles ({example})", remedy)
+        yield Finding(f"odd opening angles of {counted(count, 'camera')} ({example})", remedy)
     flat = [v for v in views if not 1 / _ASPECT <= v.fx / v.fy <= _ASPECT]
     if flat:
         example = f"{flat[0].image_name}: {flat[0].fx:.4g} and {flat[0].fy:.4g} pixels"
-        text = f"{len(flat)} cameras have focal lengths in x and y that differ more than twofold ({example})"
+        text = f"focal lengths in x and y of {counted(len(flat), 'camera')} differ more than twofold ({example})"
         yield Finding(text, "check the focal lengths and the size of the photos")
 
 
@@ -171,7 +171,7 @@ def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
     if odd:
         view = odd[0]
         at = f"{view.image_name}: {view.cx:.4g}, {view.cy:.4g} of {view.width} x {view.height}"
-        text = f"{len(odd)} cameras have their principal point in a corner or at an edge of the photo ({at})"
+        text = f"the principal point of {counted(len(odd), 'camera')} is in a corner or at an edge of the photo ({at})"
         yield Finding(text, "give cx and cy in pixels of a photo of that size, or leave them out")
 
 

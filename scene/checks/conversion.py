@@ -9,7 +9,7 @@ from groundwork.files.json_files import read_json
 from groundwork.finding import Finding, fine, note
 from groundwork.host import torchrun
 from groundwork.host.listing import some
-from scene.readers.scene_folder import REPORT, WORK, find_capture, is_scene, is_unrelated
+from scene.readers.scene_folder import REPORT, WORK, describe_verdict, find_capture, is_scene, is_unrelated
 
 REGISTERED = 0.9  # share of the photos that a good conversion places
 
@@ -71,11 +71,11 @@ def describe_changed_photos(source: str | os.PathLike) -> str | None:
 
 def describe_left_out(source: str | os.PathLike) -> str | None:
     """Describe the photos that convert.py could not place; None if it placed all, or did not make the scene."""
+    if said := describe_verdict(source):
+        return said
     try:
         report = read_json(Path(source) / REPORT)
         placed, count = int(report["registered"]), int(report["photos"])
-        if text := report.get("unusable"):
-            return f"convert.py says of this scene: {text}"
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
     share = f"{placed} of {count} photos ({placed / max(count, 1):.0%})"
@@ -103,12 +103,11 @@ def check_conversion(source: str | os.PathLike) -> Iterator[Finding]:
         report = read_json(path)
         placed, photos = int(report["registered"]), int(report["photos"])
         advice = [str(line) for line in report["advice"]]
-        verdict = report.get("unusable")
     except (OSError, ValueError, KeyError, TypeError):
         yield Finding(f"{path} is damaged", "remove it, or run convert.py again")
         return
-    if verdict:
-        yield Finding(f"convert.py says of this scene: {verdict}", "do what its page advises, and convert again")
+    if verdict := describe_verdict(source):
+        yield Finding(verdict, "do what its page advises, and convert again")
         return
     text = f"{placed} of {photos} photos were placed by convert.py"
     remedy = advice[0].rpartition("; ")[2] if advice else "take more photos that overlap"

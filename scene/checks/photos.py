@@ -1,5 +1,6 @@
 """Checks of photos: sizes, photos of which no pixel counts, pixels that all photos share."""
 
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -8,9 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
+from groundwork.applications import has_application
 from groundwork.files.image_files import UNREADABLE, open_image
 from groundwork.finding import Finding, Severity, fine
-from groundwork.host.listing import some
+from groundwork.host.listing import counted, some
+from groundwork.host.start import typed_command
 from scene.checks.photo_files import shrunk
 from scene.checks.shared_pixels import place_of, shared_pixels
 from scene.images.decode import picture_size
@@ -18,6 +21,7 @@ from scene.images.masks import Mask
 from scene.readers.info import CameraInfo
 from utils.system_utils import UserError
 
+LOOKED_AT = 16  # photos that a training decodes, small; any check finds shared pixels in these, for one share
 FEWEST_VIEWS = 20
 _WIDE = 1600  # pixels
 SMALL = 32  # pixels; a smaller side has few more than SSIM's window
@@ -80,33 +84,42 @@ def check_views(cameras: list[CameraInfo]) -> Iterator[Finding]:
     sizes = Counter(camera.file_size for camera in cameras)
     listed = ", ".join(f"{w} x {h} ({n})" for (w, h), n in sizes.most_common(3))
     listed += f" and {len(sizes) - 3} more sizes" if len(sizes) > 3 else ""
-    yield fine(f"{len(cameras)} photos, none missing and all readable: {listed}")
+    count = counted(len(cameras), "photo")
+    yield fine(f"{count}, none missing and all readable: {listed}")
     if len(cameras) < FEWEST_VIEWS:
-        yield Finding(f"only {len(cameras)} photos", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
+        yield Finding(f"only {count}", f"take {FEWEST_VIEWS} or more; new views will look bad with fewer")
     if wide := sum(n for (width, _), n in sizes.items() if width > _WIDE):
-        yield fine(f"{wide} photos are wider than {_WIDE} pixels and train at that width unless -r 1 is given")
+        yield fine(f"{counted(wide, 'photo')} wider than {_WIDE} pixels, to train at that width unless -r 1 is given")
 
 
-def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True) -> Iterator[Finding]:
+def check_photos(
+    views: Sequence[Any], most: int, has_alpha: bool = True, photos: Path = Path("PHOTOS")
+) -> Iterator[Finding]:
     """Find photos of which no pixel counts, and pixels that all photos share; at most `most` photos are decoded.
 
     has_alpha: whether their alpha counts.
+    photos: their folder, for messages.
     """
     looks = looks_at(views, most, has_alpha)
     for cause, remedy in _HIDDEN.items():
         if hidden := [look for look in looks if look.hidden_by == cause]:
             severity = Severity.HOPELESS if len(hidden) == len(looks) else Severity.PROBLEM
             yield Finding(f"{_of(hidden, looks)} show nothing, as every pixel is left out by {cause}", remedy, severity)
-    yield from check_shared([look for look in looks if not look.hidden_by])
+    yield from check_shared([look for look in looks[:LOOKED_AT] if not look.hidden_by], photos)
 
 
-def check_shared(looks: Sequence[Look]) -> Iterator[Finding]:
-    """Name pixels that nearly all photos of one size share."""
+def check_shared(looks: Sequence[Look], photos: Path) -> Iterator[Finding]:
+    """Name pixels that nearly all photos of one size share. photos: their folder."""
+    folders = shlex.join(map(str, (photos, photos.with_name(f"{photos.name}_masks"))))
+    command = f"{typed_command('-m applications.convert.shared_masks')} {folders}"
     for size, shared in find_shared(looks).items():
         each = "each photo" if len({look.size for look in looks}) == 1 else f"each photo of {size[0]} x {size[1]}"
         text = f"{shared.mean():.0%} of {each}, {place_of(shared)}, {SHARED_TEXT}, which spoils poses and training"
-        remedy = "write masks by `python -m applications.convert.shared_masks PHOTOS MASKS`, and pass their folder as "
-        yield Finding(text, f"{remedy}--masks of train.py or --mask_path of convert.py")
+        remedy = "mask it, and pass the folder of the masks as --masks of train.py"
+        if has_application("convert"):
+            remedy = f"write masks by `{command}`, and pass its last folder as --masks of train.py and doctor.py, or "
+            remedy += "--mask_path of convert.py"
+        yield Finding(text, remedy)
 
 
 def find_shared(looks: Sequence[Look]) -> dict[tuple[int, int], np.ndarray]:

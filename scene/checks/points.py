@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from groundwork.finding import Finding, fine
-from groundwork.host.listing import some
+from groundwork.host.listing import counted, some
 from scene.checks.cameras import OTHER_FORMS
 from scene.gaussians.copies import clusters_of
 from scene.readers.info import SceneInfo, camera_centers
@@ -66,7 +66,7 @@ def _unseen(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
     away = [c.image_name for c, n in zip(info.train_cameras, counts, strict=True) if n < FEWEST_IN_VIEW]
     if len(points) < 2 * FEWEST_IN_VIEW:
         away = []
-    text = f"{len(away)} cameras have hardly any point in view ({some(away)})"
+    text = f"hardly any point is in view of {counted(len(away), 'camera')} ({some(away)})"
     if unseen > _UNSEEN or len(away) >= max(2, _OF_ANOTHER_FORM * len(counts)):
         text = f"{unseen:.0%} of the points are in no photo" if unseen > _UNSEEN else text
         yield Finding(f"{text}: poses and points do not belong together", OTHER_FORMS)

@@ -9,20 +9,21 @@ from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
 
+from groundwork.applications import has_application
 from groundwork.finding import Finding, Severity, from_error, note
 from scene.checks.cameras import check_cameras, check_extent, check_lens_shapes, check_lenses
 from scene.checks.conversion import check_conversion, describe_changed_photos, describe_left_out
 from scene.checks.fit import check_agreement, check_geometry
 from scene.checks.photo_files import check_blur, check_duplicates
-from scene.checks.photos import SHARED_TEXT, check_photos, check_size, check_views
+from scene.checks.photos import LOOKED_AT, SHARED_TEXT, check_photos, check_size, check_views
 from scene.checks.points import check_cloud, check_points
 from scene.dataset_readers import SceneInfo, read_scene
+from scene.images.masks import NO_MASKS, MaskOptions
 from scene.readers.info import NEAREST, as_camera_info
 from scene.scene import Scene
 from utils.system_utils import UserError
 
-LOOKED_AT = 16  # photos that a training decodes, small,
-MOST_PHOTOS = 100  # and the doctor
+MOST_PHOTOS = 100  # that the doctor decodes, small
 _LINES = 5  # most findings that a training prints
 
 
@@ -37,7 +38,9 @@ def findings(
     alpha = getattr(options, "mask_meaning", "") != "none"
     train, test = ([*map(as_camera_info, views)] for views in (info.train_cameras, info.test_cameras))
     info = info._replace(train_cameras=train, test_cameras=test)
-    photos = [*check_photos(train, most, alpha), *check_duplicates(info, halves)]
+    views = sorted((*train, *test), key=lambda view: str(view.image_name))  # the same ones whatever is held out
+    place = Path(getattr(options, "source_path", ""), getattr(options, "images", "images")).absolute()
+    photos = [*check_photos(views, most, alpha, *[place] * place.is_dir()), *check_duplicates(info, halves)]
     found = [*check_cameras(info), *photos, *([] if has_shared_pixels(photos) else check_points(info))]
     return sorted(found, key=lambda one: -one.severity)
 
@@ -56,7 +59,8 @@ def report(found: list[Finding], source: str | os.PathLike, quiet: bool = False)
     for one in found[:_LINES]:
         print(f"warning: {one}", file=sys.stderr)
     if len(found) > _LINES:
-        print(f"{len(found) - _LINES} more: python doctor.py -s {source}", file=sys.stderr)
+        command = f": python doctor.py -s {source}" if has_application("doctor") else ""
+        print(f"{len(found) - _LINES} more{command}", file=sys.stderr)
 
 
 def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
@@ -84,21 +88,21 @@ def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> Non
         )
 
 
-def check_dataset(source: str, images: str) -> list[Finding]:
+def check_dataset(source: str, images: str, masks: MaskOptions = NO_MASKS) -> list[Finding]:
     """Collect doctor.py's findings on the scene in a folder. images: as train.py's -i."""
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            info = read_scene(source, images, hold_out=False, native=True)
+            info = read_scene(source, images, hold_out=False, masks=masks, native=True)
     except UserError as error:
         return [*_notes(said.getvalue()), from_error(error)]
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
-    found = findings(info, most=MOST_PHOTOS)
+    found = findings(info, argparse.Namespace(source_path=source, images=images), most=MOST_PHOTOS)
     checks += [found, check_blur(info, MOST_PHOTOS)]
     if not any(check_lens_shapes(info)) and not has_shared_pixels(found):  # else poses have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
-    return [*_notes(said.getvalue()), *chain(*checks, check_conversion(source))]
+    return [*_notes(said.getvalue()), *check_conversion(source), *chain(*checks)]
 
 
 def _notes(said: str) -> list[Finding]:

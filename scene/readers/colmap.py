@@ -17,7 +17,7 @@ from scene.readers.holdout import EVERY, refuse_rule, split
 from scene.readers.info import CameraInfo, Posed, SceneInfo
 from scene.readers.photos import camera_info, to_pinholes
 from scene.readers.point_cloud import check_finite, read_point_cloud
-from scene.readers.scene_folder import REPORT
+from scene.readers.scene_folder import REPORT, describe_verdict
 from scene.readers.start_cloud import OWN_POINTS, StartCloud, StartOptions, random_in_frusta, scene_info
 from utils.graphics_utils import BasicPointCloud
 from utils.system_utils import UserError
@@ -79,7 +79,7 @@ def read_colmap(
         for photo, path, mask in zip(photos, paths, found, strict=True)
     ]
     views = split(to_pinholes(cameras, masks.drop_alpha), hold_out, rule, folder)
-    own, lacking = partial(_own_cloud, model_folder, model), f"{listed_by} has no points"
+    own, lacking = partial(_own_cloud, folder, model_folder, model), f"{listed_by} has no points"
     return scene_info(views, start, own, partial(random_in_frusta, views[0]), lacking)
 
 
@@ -106,13 +106,15 @@ def _pose(photo: Image) -> tuple[np.ndarray, np.ndarray]:
     return qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
 
 
-def _own_cloud(model_folder: Path, model: ColmapModel) -> StartCloud | None:
+def _own_cloud(folder: Path, model_folder: Path, model: ColmapModel) -> StartCloud | None:
     source, ply = _file(model_folder, _POINTS, "bin"), model_folder / f"{_POINTS}.ply"
     if ply.is_file():
         if source is None or not len(model.points.ids) or ply.stat().st_mtime >= source.stat().st_mtime:
             return StartCloud(read_point_cloud(ply), ply)
         remedy = f"to use it, give --init_pcd_path {ply}"
         print(f"{ply} is older than {source.name} and is not used; {remedy}", file=sys.stderr)
+    if not len(model.points.ids) and (verdict := describe_verdict(folder)):  # no other points would end this fault
+        raise UserError(verdict)
     if source is None:
         return None
     check_finite(model.points.xyz, source)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from groundwork.files.image_files import PHOTO_SUFFIXES, VIDEO_SUFFIXES
+from groundwork.files.json_files import read_json
 from groundwork.host.listing import some
 from groundwork.host.start import typed_command
 from scene.readers.metashape import cameras_xml
@@ -49,6 +50,15 @@ def kind_of(source_path: str | os.PathLike) -> str:
 def is_scene(folder: str | os.PathLike) -> bool:
     """Tell whether a folder has cameras of one of the kinds."""
     return _kind(Path(folder)) is not None
+
+
+def describe_verdict(folder: str | os.PathLike) -> str:
+    """Say why convert.py would not train on a scene that it made; "" if it would, or did not make the scene."""
+    try:
+        verdict = read_json(Path(folder) / REPORT).get("unusable")
+    except (OSError, ValueError, AttributeError):
+        return ""
+    return f"convert.py says of this scene: {verdict}" if verdict else ""
 
 
 def is_unrelated(folder: Path) -> bool:

@@ -15,6 +15,8 @@ from arguments import write_cfg_args, write_model_json
 from arguments.launch import launch_options, training_parser
 from groundwork.applications import application
 from scene.checks.conversion import awaits_conversion
+from scene.gaussians.checkpoint import load_checkpoint
+from scene.images.store import image_device
 from splatting.agreement import agree_on_options
 from splatting.events import summary_writer
 from splatting.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
@@ -23,7 +25,7 @@ from splatting.registry import PARTS, check_together, chosen
 from splatting.run import Run
 from splatting.scores import training_report
 from utils.general_utils import safe_state
-from utils.system_utils import UserError, mkdir_p
+from utils.system_utils import UserError, compute_device, mkdir_p
 
 __all__ = ["main", "parse", "prepare_output_and_logger", "train", "training", "training_report"]
 
@@ -99,11 +101,22 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     return args, *options
 
 
+def _check_places(dataset: argparse.Namespace, launch: argparse.Namespace) -> None:
+    """Refuse a model folder or a checkpoint (UserError), and name a device, that would fail after a conversion."""
+    image_device(dataset.data_device, compute_device(), warn=True)
+    if launch.start_checkpoint:
+        load_checkpoint(launch.start_checkpoint, mapped=True)
+    if dataset.model_path:
+        mkdir_p(dataset.model_path)
+
+
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     if dataset.source_path and awaits_conversion(dataset.source_path):
-        application("convert", "command").convert_first(dataset.source_path)
+        conversion = application("convert", "command")
+        _check_places(dataset, args)
+        conversion.convert_first(dataset.source_path)
     if args.advise or args.options == "auto":
         given = sys.argv[1:] if argv is None else argv
         words = application("doctor", "advice").asked_options(resolve_lenses(dataset, None), args, given)

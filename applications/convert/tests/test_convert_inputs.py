@@ -156,7 +156,7 @@ def test_without_the_reader_of_heic_the_message_has_the_line_that_installs_it(tm
         _save(tmp_path / name, "HEIF")
     monkeypatch.delitem(Image.OPEN, "HEIF")
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(UserError, match=r"1 photos .*: 6.heic \(HEIC: .*pip install '\.\[heic\]'`, or export as JPEG"):
+    with pytest.raises(UserError, match=r"1 photo .*: 6.heic \(HEIC: .*pip install '\.\[heic\]'`, or export as JPEG"):
         sort_inputs(tmp_path)
     assert sort_inputs(tmp_path, skip_unreadable=True).photos == ["1.jpg", "2.jpg", "3.jpg"]
 

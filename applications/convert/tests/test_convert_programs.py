@@ -25,13 +25,17 @@ ROOT = Path(__file__).resolve().parents[3]
 SETTINGS = Settings("OPENCV", 8192, "exhaustive", "incremental", no_gpu=True)
 
 
-def test_ctrl_c_ends_the_program_that_works(tmp_path):
+@pytest.mark.parametrize("is_for_group", [False, True])
+def test_ctrl_c_ends_the_program_that_works(tmp_path, is_for_group):
+    """Also where the program gets the signal, too, and ends by itself."""
     log, script = tmp_path / "log", "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
 
     def interrupt() -> None:
         try:
             wait_for(lambda: log.is_file() and log.read_text().endswith("\n"))
         finally:
+            if is_for_group:
+                os.kill(int(log.read_text()), signal.SIGTERM)
             os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt).start()

@@ -219,6 +219,19 @@ def test_what_stands_in_the_way_is_named(tmp_path, what, said):
     assert not (tmp_path / "distorted").exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "path", "said"),
+    [("-m", "file/out", "cannot create the folder"), ("--start_checkpoint", "a.pth", "no checkpoint .*a.pth")],
+)
+def test_places_are_judged_before_a_conversion(tmp_path, monkeypatch, capsys, option, path, said):
+    monkeypatch.setattr(convert, "convert_first", lambda source: pytest.fail("converted"))
+    make_photos(tmp_path, 3)
+    (tmp_path / "file").touch()
+    with pytest.raises(UserError, match=said):
+        train.main(["-s", str(tmp_path), "--data_device", "cuda:9", option, str(tmp_path / path)])
+    assert "--data_device cuda:9 is not available" in capsys.readouterr().err
+
+
 def test_a_folder_that_is_read_only_is_named(tmp_path, monkeypatch):
     make_photos(tmp_path, 3)
     monkeypatch.setattr(os, "access", lambda *_: False)

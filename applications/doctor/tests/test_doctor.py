@@ -166,10 +166,10 @@ def test_points_and_cameras_that_do_not_meet(info):
     )
     assert _said(check_points(dataclasses.replace(away, has_random_points=True))) == []
     few = _with_cloud(_with_cameras(info, lambda i, camera: turned(camera) if i % 4 == 0 else {}), many)
-    assert "5 cameras have hardly any point in view" in (line := _said(check_points(few))[0]) and "remove" not in line
+    assert "hardly any point is in view of 5 cameras" in (line := _said(check_points(few))[0]) and "remove" not in line
     one = _with_cloud(_with_cameras(info, lambda i, camera: {} if i else turned(camera)), many)
     name = info.train_cameras[0].image_name
-    assert f"1 cameras have hardly any point in view ({name})" in _said(check_points(one))[0]
+    assert f"hardly any point is in view of 1 camera ({name})" in _said(check_points(one))[0]
     far = many.copy()
     far[::20] = 1e5
     assert "5.0% of the points are more than 100 extents away" in _said(check_points(_with_cloud(info, far)))[0]
@@ -205,6 +205,11 @@ def test_what_convert_noted(colmap_scene):
     assert "PROBLEM only 17 of 30 photos were placed by convert.py -> take more photos between them" in said
     path.write_text("{")
     assert "convert_report.json is damaged" in str(problems(check_dataset(str(colmap_scene), "images")))
+    path.write_text(json.dumps(report | {"unusable": "the camera turned, so do not train; walk"}))
+    verdict = "PROBLEM convert.py says of this scene: the camera turned, so do not train"
+    assert problems(check_dataset(str(colmap_scene), "images"))[0].startswith(verdict)
+    (colmap_scene / "sparse" / "0" / "points3D.bin").write_bytes(bytes(8))  # none
+    assert problems(check_dataset(str(colmap_scene), "images")) == [f"{verdict} -> walk"]
 
 
 @pytest.fixture

@@ -174,7 +174,8 @@ def _check_shapes(call: Call, given: Item, form: tuple[int, ...]) -> None:
             raise ValueError(f"{name}{of} must be (..., {count}, {form}), got {found}")
         shapes.append((name, values, ((), *both) if harmonic else both, (count, *found[-1 - harmonic :])))
     if given.background is not None:
-        shapes.append(("backgrounds", given.background, each, given.background.shape[-1:]))
+        width = (given.colors if call.colored else given.background).shape[-1:]
+        shapes.append(("backgrounds", given.background, each, width))
     for name, values, leads, tail in shapes:
         if values is None or all(values.shape != (*lead, *tail) for lead in leads):
             raise ValueError(
