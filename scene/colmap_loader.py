@@ -263,6 +263,16 @@ def _point(file: "_TextFile") -> tuple[int | float, ...]:
     return tuple(values)  # many lists would keep the garbage collector busy
 
 
+def _table_of_points(rows: Sequence[Sequence[str | int | float]]) -> Points:
+    """The points of rows of id, x, y, z, red, green, blue and error. ValueError where `_point` refuses one."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
+    xyz, rgb = table[:, 1:4], table[:, 4:7]
+    if not (np.isfinite(xyz.sum(axis=1)).all() and ((rgb >= 0) & (rgb <= 255)).all() and (ids >= 0).all()):
+        raise ValueError("not finite, or no colour")
+    return Points(ids, xyz, rgb, table[:, 7])
+
+
 class _Numbered(NamedTuple):
     """Names of places in a file, made when they are asked for."""
 
@@ -400,14 +410,15 @@ class _TextFile:
 
     def points(self) -> tuple[Points, "_Numbered"]:
         """The points, and the place of each."""
-        numbers: list[int] = []
-        rows = []
-        for row in self.records("point", _point):
+        rows, numbers = [], []
+        for row in self.records("point", lambda file: file._rest.split(maxsplit=8)[:8]):
             rows.append(row)
             numbers.append(self._number)
-        table = np.array(rows, dtype=np.float64).reshape(-1, 8)
-        ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
-        return Points(ids, table[:, 1:4], table[:, 4:7], table[:, 7]), _Numbered("line", numbers)
+        try:
+            points = _table_of_points(rows)
+        except (ValueError, OverflowError):  # which one it is, they say one by one, which takes three times as long
+            points = _table_of_points(list(self.records("point", _point)))
+        return points, _Numbered("line", numbers)
 
     def take(self, kinds: str) -> list[int | float]:
         """A value for each letter: a float for d, else an integer."""

@@ -28,6 +28,9 @@ from groundwork.files.tensor_files import read_tensors
 from utils.system_utils import UserError
 
 NETS = {"alex": "alexnet", "vgg": "vgg16", "squeeze": "squeezenet1_1"}  # backbones, and torchvision's names for them
+# torchvision's weights for ImageNet. Its import takes seconds, which a machine without the files should not wait for.
+_FILES = {"alex": "alexnet-owt-7be5be79.pth", "vgg": "vgg16-397923af.pth", "squeeze": "squeezenet1_1-b8a52dc0.pth"}
+_SITE = "https://download.pytorch.org/models"
 MIN_SIDE = {"vgg": 16, "alex": 31, "stlpips": 21}  # pixels; smaller images shrink to nothing in pooling
 _OF_DISTS = "f5e65c96230b7f6ca995691647d482237e4cab8a50c5c4a5784f219ef0748218"  # SHA-256 of its package's weights.pt
 _OF_STLPIPS = "b356b382f96010f77d085ee8343ecd9fd322d0a56e8de2b2d0549fafcad8b9ee"  # of its shift-tolerant AlexNet
@@ -183,8 +186,7 @@ def _lacking(file: Path, net: str) -> str:
 
 
 def _url(net: str) -> str:
-    import_lpips()  # makes torchvision importable
-    return importlib.import_module("torchvision.models").get_model_weights(NETS[net]).IMAGENET1K_V1.url
+    return f"{_SITE}/{_FILES[net]}"
 
 
 def _digest_of(file: Path) -> str:

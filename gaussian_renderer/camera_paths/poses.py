@@ -48,9 +48,8 @@ class Poses:
 
     @property
     def spread(self) -> float:
-        """Mean distance of the cameras from their middle, 0 where they are all in one place."""
-        spread = np.linalg.norm(self.positions - self.positions.mean(axis=0), axis=1).mean()
-        return float(spread) if spread > SAME_PLACE * max(1.0, float(np.abs(self.positions).max())) else 0.0
+        """`spread_of` the cameras."""
+        return spread_of(self.positions)
 
     @property
     def quaternions(self) -> np.ndarray:
@@ -64,12 +63,30 @@ def _rotations(turns: np.ndarray) -> "Rotation":
     return Rotation.from_matrix(turns)
 
 
+def spread_of(positions: np.ndarray) -> float:
+    """Mean distance of positions (N,3) from their middle, 0 where they are all in one place."""
+    spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean()
+    return float(spread) if spread > SAME_PLACE * max(1.0, float(np.abs(positions).max())) else 0.0
+
+
 def poses_of(cameras: Sequence[Camera]) -> Poses:
     """The poses of views, by their matrices."""
-    views = np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
-    positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
+    views = _matrices(cameras)
     turns = _rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
-    return Poses(positions, turns, np.degrees([vertical_fov(camera) for camera in cameras]))
+    return Poses(_positions(views), turns, np.degrees([vertical_fov(camera) for camera in cameras]))
+
+
+def positions_of(cameras: Sequence[Camera]) -> np.ndarray:
+    """The positions (N,3) float64 of views, without SciPy, which takes a while to import."""
+    return _positions(_matrices(cameras))
+
+
+def _matrices(cameras: Sequence[Camera]) -> np.ndarray:
+    return np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
+
+
+def _positions(views: np.ndarray) -> np.ndarray:
+    return -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
 
 
 def vertical_fov(camera: Camera) -> float:

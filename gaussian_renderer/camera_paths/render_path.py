@@ -22,8 +22,8 @@ from gaussian_renderer.camera_paths.keyframes import (
 from gaussian_renderer.camera_paths.video import find_ffmpeg, write_video
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.memory_errors import explain_memory_errors
-from groundwork.files.image_files import remove_leftovers, save_png, to_bytes
-from groundwork.host.progress import Bar
+from groundwork.files.image_files import pictures_at_once, remove_leftovers, to_bytes, write_png
+from groundwork.host.progress import Bar, in_threads
 from scene.cameras import Camera
 from scene.scene import Scene
 from utils.system_utils import UserError
@@ -162,16 +162,24 @@ def render_path(
     remedy = "pass a smaller --size" if request.size else "lower --resolution (-r), or pass a smaller --size"
     remove_leftovers(images, count if request.frames else 0)
 
+    def draw(number: int) -> np.ndarray:
+        pose = path.at(frame_moment(path, request.fps, number))
+        view = free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, background.device)
+        with explain_memory_errors(scene.gaussians, [view], remedy):
+            drawn = render(view, scene.gaussians, pipe, background, want_depth=False, want_visibility=False)
+            return to_bytes(drawn["render"]).numpy()
+
     def frames() -> Iterator[np.ndarray]:
-        for number in Bar(range(count), desc=f"Rendering {request.name}", unit="frame"):
-            pose = path.at(frame_moment(path, request.fps, number))
-            view = free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, background.device)
-            with explain_memory_errors(scene.gaussians, [view], remedy):
-                drawn = render(view, scene.gaussians, pipe, background, want_depth=False, want_visibility=False)
-                pixels = to_bytes(drawn["render"])
-            yield pixels.numpy()
-            if request.frames:
-                save_png(pixels.permute(2, 0, 1), images / f"{number:05d}.png")
+        size = pictures_at_once(width * height)
+        with Bar(total=count, desc=f"Rendering {request.name}", unit="frame") as bar:
+            for first in range(0, count, size):
+                numbers = range(first, min(first + size, count))
+                drawn = list(map(draw, numbers))
+                if request.frames:
+                    in_threads(write_png, drawn, [images / f"{number:05d}.png" for number in numbers], disable=True)
+                for pixels in drawn:
+                    yield pixels
+                    bar.update()
 
     write_video(video, frames(), width, height, request.fps)
     seconds, size = count / request.fps, video.stat().st_size / 1e6

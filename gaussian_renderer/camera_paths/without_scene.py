@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gaussian_renderer.camera_paths.poses import look_along, poses_of
+from gaussian_renderer.camera_paths.poses import look_along, positions_of, spread_of
 from groundwork.files.json_files import read_json
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
@@ -122,9 +122,9 @@ def have_moved(folder: Path, cameras: Sequence[Camera]) -> bool:
     pairs = [(camera, recorded[camera.image_name]) for camera in cameras if camera.image_name in recorded]
     if not pairs:
         return False
-    now, then = (poses_of(each) for each in zip(*pairs, strict=True))
-    apart = np.linalg.norm(now.positions - then.positions, axis=1)
-    return bool(np.median(apart) > _MOVED * then.spread > 0)
+    now, then = (positions_of(each) for each in zip(*pairs, strict=True))
+    apart = np.linalg.norm(now - then, axis=1)
+    return bool(np.median(apart) > _MOVED * spread_of(then) > 0)
 
 
 def _recorded(number: int, entry: Mapping[str, Any]) -> CameraInfo:

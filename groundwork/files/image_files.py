@@ -18,6 +18,7 @@ from groundwork.files.color_tags import add_profile
 from groundwork.files.plain_files import plain_path
 from groundwork.files.writing import atomic_write
 from groundwork.host.errors import UserError
+from groundwork.host.machine import threads
 
 if TYPE_CHECKING:
     import torch
@@ -43,6 +44,8 @@ VIDEO_SUFFIXES = (
 # What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
 # file's name is.
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "AVIF", "HEIF", "TGA")
+PNG_LEVEL = 1  # of zlib, as 6 takes four times as long for files that are 10 % smaller (docs/results/waiting.md)
+_PIXELS_HELD = 1 << 26  # of pictures that wait to be written
 SCALE = "scale"  # key of a plane's text chunk: value = pixel * scale
 _STEPS = 65535
 _EIGHT_BITS = ((np.arange(1 << 16) + 128) // 257).astype(np.uint8)  # of a 16-bit grey; 255 is 65535
@@ -88,8 +91,18 @@ def dim_masked(image: torch.Tensor, counts: torch.Tensor) -> torch.Tensor:
 
 def save_png(image: torch.Tensor, path: Path) -> None:
     """Write an image of a form that `to_bytes` takes; the file is written whole or not at all."""
+    write_png(to_bytes(image).numpy(), path)
+
+
+def write_png(pixels: np.ndarray, path: str | os.PathLike, text: PngImagePlugin.PngInfo | None = None) -> None:
+    """Write pixels (H, W, 3) uint8, or (H, W) uint8 or uint16, as a PNG, whole or not at all; in any thread."""
     with atomic_write(path) as temporary:
-        Image.fromarray(to_bytes(image).numpy()).save(temporary)
+        Image.fromarray(pixels).save(temporary, compress_level=PNG_LEVEL, pnginfo=text)
+
+
+def pictures_at_once(pixels: int) -> int:
+    """Return how many pictures of so many pixels are held while `in_threads` reads or writes them."""
+    return max(1, min(threads(), _PIXELS_HELD // max(pixels, 1)))
 
 
 def remove_leftovers(folder: Path, count: int) -> None:
@@ -111,8 +124,7 @@ def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | No
     steps = np.clip(np.round(values.astype(np.float64) / scale), 0, _STEPS).astype(np.uint16)
     text = PngImagePlugin.PngInfo()
     text.add_text(SCALE, repr(scale))
-    with atomic_write(path) as temporary:
-        Image.fromarray(steps).save(temporary, pnginfo=text)
+    write_png(steps, path, text)
 
 
 def plane_scale(path: Path) -> float | None:

@@ -125,15 +125,17 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
             f"{len(parts['f_rest'])}; give the --sh_degree of the file"
         )
     rows = {}
-    for (name, attribute), values in zip(table.items(), _columns(vertices, list(parts.values())), strict=True):
-        if len(attribute.shape) == 2:
+    for name, attribute in table.items():
+        if len(attribute.shape) == 2:  # a file has the bands of one channel after those of another
             bands, channels = attribute.shape
-            values = values.reshape(len(vertices), channels, bands).transpose(1, 2).contiguous()
-        rows[name] = values
+            parts[name] = [parts[name][channel * bands + band] for band in range(bands) for channel in range(channels)]
+    for (name, attribute), values in zip(table.items(), _columns(vertices, list(parts.values())), strict=True):
+        rows[name] = values.reshape(len(vertices), *attribute.shape) if len(attribute.shape) == 2 else values
     rows["scaling"] = with_scales(rows["scaling"])
     rows = apply_foreign_filter(path, rows, vertices, {name for columns in parts.values() for name in columns})
     absent = attributes(sh_degree)["f_rest"].shape[0] - rows["f_rest"].shape[1]
-    rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
+    if absent:
+        rows["f_rest"] = torch.nn.functional.pad(rows["f_rest"], (0, 0, 0, absent))
     return rows
 
 
@@ -194,8 +196,8 @@ def _columns(vertices: np.ndarray, parts: list[list[str]]) -> Iterator[Tensor]:
         table = np.asarray(vertices).view("<f4").reshape(len(vertices), len(vertices.dtype.names))
         position = {name: i for i, name in enumerate(vertices.dtype.names)}
         for part in parts:
-            columns = table[:, [position[name] for name in part]]  # NumPy lays these out column by column
-            yield torch.from_numpy(np.ascontiguousarray(columns))
+            chosen = torch.tensor([position[name] for name in part], dtype=torch.long)
+            yield torch.from_numpy(table).index_select(1, chosen)
         return
     for part in parts:
         matrix = np.empty((len(vertices), len(part)), dtype=np.float32)

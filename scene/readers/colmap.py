@@ -50,7 +50,7 @@ def read_colmap(
 
     Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
-    model_folder, model = find_model(folder)
+    model_folder, model = find_model(folder, with_points=start is not None)
     note_unread(model_folder, "colmap", _side_files(model_folder))
     if (listed := model_folder / "test.txt").is_file():  # of the reference, whose train.py does not read it either
         refuse_rule(rule, listed)
@@ -122,11 +122,11 @@ def _own_cloud(folder: Path, model_folder: Path, model: ColmapModel) -> StartClo
     return StartCloud(BasicPointCloud(model.points.xyz, colors, np.zeros_like(colors)), None)
 
 
-def find_model(scene: Path) -> tuple[Path, ColmapModel]:
+def find_model(scene: Path, with_points: bool = True) -> tuple[Path, ColmapModel]:
     """Folder and contents of the COLMAP model with the most registered photos, in `sparse` or one of its sub-folders.
 
     Among equals `sparse/0` comes first, then `sparse`. A message says which of several models is used. UserError saying
-    what was found when there is no model, or none that can be read.
+    what was found when there is no model, or none that can be read. with_points: as for `read_model`.
     """
     sparse = scene / "sparse"
     inside = sorted(path for path in sparse.iterdir() if path.is_dir())
@@ -144,7 +144,7 @@ def find_model(scene: Path) -> tuple[Path, ColmapModel]:
     models, errors = {}, []
     for folder in folders:
         try:
-            models[folder] = read_model(folder)
+            models[folder] = read_model(folder, with_points=with_points)
         except UserError as error:
             errors.append(error)
     if not models:
@@ -172,15 +172,16 @@ def _say_if_text_is_newer(folder: Path) -> None:
         )
 
 
-def read_model(folder: Path, with_2d_points: bool = False) -> ColmapModel:
+def read_model(folder: Path, with_2d_points: bool = False, with_points: bool = True) -> ColmapModel:
     """Read a binary model, or a text model if that is missing or broken. UserError when neither can be read.
 
-    A file that is missing in one kind is taken in the other.
+    A file that is missing in one kind is taken in the other. with_points: False leaves out the points of a text file,
+    which take a second for 300,000.
     """
     kinds, errors = _kinds(folder), []
     for suffix in kinds:
         try:
-            model = read_model_of_kind(folder, suffix, with_2d_points)
+            model = read_model_of_kind(folder, suffix, with_2d_points, with_points)
         except UserError as error:
             errors.append(error)
             continue
@@ -190,7 +191,9 @@ def read_model(folder: Path, with_2d_points: bool = False) -> ColmapModel:
     raise errors[0] if errors else UserError(f"no COLMAP model in {folder}; copy the whole model there")
 
 
-def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) -> ColmapModel:
+def read_model_of_kind(
+    folder: Path, suffix: str, with_2d_points: bool = False, with_points: bool = True
+) -> ColmapModel:
     """Read a model in .bin or .txt files, and what it lacks in the other kind.
 
     UserError where one cannot be read or a photo's camera is missing.
@@ -202,7 +205,7 @@ def read_model_of_kind(folder: Path, suffix: str, with_2d_points: bool = False) 
     try:
         cameras = read_cameras(paths[0], binary[0])
         images = read_images(paths[1], binary[1], with_2d_points)
-        points = read_points(paths[2], binary[2]) if paths[2] else _NO_POINTS
+        points = read_points(paths[2], binary[2]) if paths[2] and (with_points or binary[2]) else _NO_POINTS
     except OSError as error:
         raise UserError(f"cannot read {error.filename} ({error.strerror}); fix its permissions, or {AGAIN}") from error
     for image in images.values():

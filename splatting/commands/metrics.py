@@ -19,8 +19,9 @@ import torch
 from fused_ssim import fused_ssim
 
 from arguments import OptionParser, read_cfg_args
+from groundwork.files.image_files import pictures_at_once
 from groundwork.files.json_files import read_json, write_json
-from groundwork.host.progress import Bar
+from groundwork.host.progress import Bar, in_threads
 from splatting.records import renders
 from splatting.records.model_folder import json_or_none
 from splatting.records.renders import DEPTHS, FITTED, INCOMPLETE, TIMES, image_of, image_size, mask_of, model_digest
@@ -211,21 +212,29 @@ def make_metrics(lpips_net: str, weights: Path | None, smallest_side: int, stlpi
 
 
 def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: bool = False) -> Scores:
-    """Compute every metric of every pair, {metric: {file name: value}}, with one pair in memory at a time.
+    """Compute every metric of every pair, {metric: {file name: value}}, with few pairs in memory at a time.
 
     A pair without pixels that count is left out. errors: write an error map of each, too.
     """
     scores: Scores = {key: {} for key in metrics}
-    for pair in Bar(pairs, desc=title, unit="view"):
-        render, truth = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
-        mask = mask_of(pair.truth.parents[1], pair.name)
-        if mask is not None and not mask.any():
-            continue
-        for key, metric in metrics.items():
-            scores[key][pair.name] = metric(render, truth, mask)
-        if errors:
-            renders.write_error_map(pair.truth.parents[1], pair.name, truth, render, mask)
+    size = pictures_at_once(max((math.prod(pair.size) for pair in pairs), default=0))  # read at once, by all cores
+    with Bar(total=len(pairs), desc=title, unit="view") as bar:
+        for first in range(0, len(pairs), size):
+            batch = pairs[first : first + size]
+            for pair, (render, truth, mask) in zip(batch, in_threads(_images_of, batch, disable=True), strict=True):
+                if mask is None or mask.any():
+                    for key, metric in metrics.items():
+                        scores[key][pair.name] = metric(render, truth, mask)
+                    if errors:
+                        renders.write_error_map(pair.truth.parents[1], pair.name, truth, render, mask)
+                bar.update()
     return scores
+
+
+def _images_of(pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Return render and ground truth (H, W, 3) uint8, and the mask (H, W) bool of the pixels that count, None: all."""
+    render, truth = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
+    return render, truth, mask_of(pair.truth.parents[1], pair.name)
 
 
 def _unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> dict[str, float | None]:

@@ -21,24 +21,32 @@ import copy
 import shutil
 import sys
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import groundwork.host.openmp  # noqa: F401  isort: skip  (before torch)
 import numpy as np
 import torch
-from PIL import Image
 
 from arguments import ModelParams, OptionParser, PipelineParams, get_combined_args, read_cfg_args, warn_of_background
 from gaussian_renderer.blending import PLANES, view_planes
 from gaussian_renderer.camera_paths.render_path import add_path_options, path_request, render_path
+from gaussian_renderer.camera_paths.without_scene import WithoutScene, saved_scene, warn_if_moved
 from gaussian_renderer.memory_errors import explain_memory_errors
 from gaussian_renderer.rays import check_views
 from gaussian_renderer.scored_views import ScoredViews, extra_test_views
-from groundwork.files.image_files import open_image, remove_leftovers, save_png, write_plane
+from groundwork.files.image_files import (
+    open_image,
+    pictures_at_once,
+    remove_leftovers,
+    to_bytes,
+    write_plane,
+    write_png,
+)
 from groundwork.files.json_files import write_json
-from groundwork.host.progress import Bar
+from groundwork.host.machine import threads
+from groundwork.host.progress import Bar, in_threads
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
 from scene.point_depths import PointDepths, held_out_points
@@ -47,10 +55,7 @@ from scene.scene import Scene
 from scene.with_splats import load_file
 from splatting.records.renders import BESIDE, DEPTHS, ERRORS, INCOMPLETE, TIMES, model_digest, summarise_times
 from utils.general_utils import safe_state
-from utils.system_utils import UserError, atomic_write, compute_device, mkdir_p
-
-if TYPE_CHECKING:
-    from gaussian_renderer.camera_paths.without_scene import WithoutScene
+from utils.system_utils import UserError, compute_device, mkdir_p
 
 _COMPARED, _FEWEST, _SMALL = 24, 6, (32, 32)  # most and fewest views that are compared, and their size in pixels
 _BETTER, _FITTING = 0.9, 0.75  # shares: of other photos that are less like a render than its own, and of such renders
@@ -88,27 +93,50 @@ def write_views(
     for view in {(view.image_width, view.image_height): view for view in views}.values():
         # The first call of a size also pays for allocations and caches.
         scored.whole(view, gaussians)
-    for index, view in enumerate(Bar(views, desc=f"Rendering {folder.parent.name}", unit="view", disable=not views)):
-        _wait(background.device)
-        start = time.perf_counter()
-        image = scored.whole(view, gaussians)
-        _wait(background.device)
-        seconds.append(time.perf_counter() - start)
-        save_png(scored.part(image), folder / "renders" / f"{index:05d}.png")
-        save_png(scored.target(view), folder / "gt" / f"{index:05d}.png")
-        for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
-            if plane in planes:
-                path = folder / plane / f"{index:05d}.png"
-                write_plane(path, scored.part(values)[0].cpu().numpy(), PLANES[plane].white)
-            if plane == "depth" and points and view.image_name in points:
-                errors[f"{index:05d}.png"] = points[view.image_name].scores(values, view.counted_pixels)
-        if (mask := scored.mask(view)) is not None:  # white where pixels count
-            with atomic_write(folder / "masks" / f"{index:05d}.png") as temporary:
-                Image.fromarray(mask[0].to(torch.uint8).mul(255).cpu().numpy()).save(temporary)
+    # All cores read the photos of a batch, then its views are drawn, which nothing disturbs, then all cores write.
+    with Bar(total=len(views), desc=f"Rendering {folder.parent.name}", unit="view", disable=not views) as bar:
+        for batch in _batches(views):
+            files = _truths(folder, batch, scored, bar.n)
+            for index, view in enumerate(batch, bar.n):
+                _wait(background.device)
+                start = time.perf_counter()
+                image = scored.whole(view, gaussians)
+                _wait(background.device)
+                seconds.append(time.perf_counter() - start)
+                name = f"{index:05d}.png"
+                files.append(partial(write_png, to_bytes(scored.part(image)).numpy(), folder / "renders" / name))
+                for plane, values in view_planes(view, gaussians, pipe).items() if planes else ():
+                    if plane in planes:
+                        shown = scored.part(values)[0].cpu().numpy()
+                        files.append(partial(write_plane, folder / plane / name, shown, PLANES[plane].white))
+                    if plane == "depth" and points and view.image_name in points:
+                        errors[name] = points[view.image_name].scores(values, view.counted_pixels)
+            in_threads(partial.__call__, files, disable=True)
+            bar.update(len(batch))
     if errors:
         write_json(folder / DEPTHS, errors)
     (folder / INCOMPLETE).unlink(missing_ok=True)
     return seconds
+
+
+def _batches(views: list[Camera]) -> Iterator[list[Camera]]:
+    """Yield the views in lists of as many as are read, drawn and written at once."""
+    size = pictures_at_once(max((view.image_width * view.image_height for view in views), default=0))
+    return (views[start : start + size] for start in range(0, len(views), size))
+
+
+def _truths(folder: Path, views: list[Camera], scored: ScoredViews, first: int) -> list[partial[None]]:
+    """Return what writes the ground truth and masks of views, of which `first` is the number of the first one."""
+    if pictures := [picture for view in views for picture in getattr(view, "undecoded", ())]:
+        views[0].images.prefetch(pictures)
+    files = []
+    for index, view in enumerate(views, first):
+        name = f"{index:05d}.png"
+        files.append(partial(write_png, to_bytes(scored.target(view)).numpy(), folder / "gt" / name))
+        if (mask := scored.mask(view)) is not None:  # white where pixels count
+            white = mask[0].to(torch.uint8).mul(255).cpu().numpy()
+            files.append(partial(write_png, white, folder / "masks" / name))
+    return files
 
 
 def _wait(device: torch.device) -> None:
@@ -213,7 +241,7 @@ def _loaded(
     load: function that loads a saved iteration; `saved_scene` also loads it without the scene.
     """
     options = copy.copy(dataset)
-    options.images_to_load = 1  # each photo is used once
+    options.images_to_load = 2 * threads()  # photos and masks of a batch
     scene = load_file(options, ply, pipeline) if ply else load(options, iteration, sh_degree)
     if not ply and getattr(dataset, "other_scene", ""):
         scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
@@ -223,8 +251,6 @@ def _loaded(
     views = *scene.getTrainCameras(), *scene.getTestCameras()
     check_views(pipeline, views)
     if not (ply or getattr(dataset, "other_scene", "")):
-        from gaussian_renderer.camera_paths.without_scene import warn_if_moved  # SciPy takes a while to import
-
         warn_if_moved(scene.model_path, views)
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
 
@@ -255,7 +281,7 @@ def warn_if_elsewhere(model: str, folder: Path) -> None:
 
 def main() -> None:
     parser = OptionParser(description="Render the train and test views of a trained model, or a video of it.")
-    # Each photo is used once, so one is kept in memory.
+    # Each photo is used once, so few are kept in memory.
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
     pipeline_params = PipelineParams(parser, sentinel=True)
     parser.add_argument("--iteration", type=int, default=-1, help="saved iteration to render (default: -1, the last)")
@@ -282,11 +308,9 @@ def main() -> None:
     warn_of_background(options)
     request = path_request(args)
     if request:
-        from gaussian_renderer.camera_paths.without_scene import saved_scene  # as above
-
         scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
         if request.make is None:
-            from gaussian_renderer.camera_paths.from_above import render_top  # as above
+            from gaussian_renderer.camera_paths.from_above import render_top  # rarely needed
 
             render_top(scene, options.source_path, pipeline, background, request.size)
         else:
