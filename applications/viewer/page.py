@@ -62,10 +62,10 @@ class Page:
         untrained: bool = False,
         oriented: str | None = None,
     ) -> None:
-        """Start to listen. UserError if that cannot be done. white: the background at first, else black.
+        """Start to listen. UserError if that cannot be done.
 
-        port: 0 for any that is free. kept: (N,) bool, what cleaning leaves of the model, if that is known.
-        untrained: the Gaussians are the points of a scene, so that the page shows where all of its cameras stand.
+        port: 0 for any that is free. white: the background at first, else black. kept: (N,) bool, what cleaning leaves.
+        untrained: the Gaussians are a scene's points, and the page shows where its cameras stand.
         oriented: the scene's folder, "" without one, if the page may set right how it stands; None: it may not.
         """
         gaussians, folder = scene.gaussians, Path(scene.model_path)

@@ -1,6 +1,6 @@
 """Seconds that a user waits for commands around the kernels: rendering to files, scoring, starting a training.
 
-    python -m benchmarks.waiting MODEL --checkout . OLDER
+    python -m benchmarks.gate.waiting MODEL --checkout . OLDER
 
 MODEL is a trained model whose scene is there. The commands take turns on all checkouts, which share the installed
 extensions; a number is the median of --repeats runs. A run of all commands before them warms the caches of files.
@@ -55,7 +55,7 @@ def _digest(model: Path) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.waiting", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.gate.waiting", description=__doc__.partition("\n")[0])
     parser.add_argument("model", type=Path, metavar="MODEL", help="folder of a trained model")
     parser.add_argument("--checkout", type=Path, nargs="+", default=[Path()], metavar="DIR",
         help="checkouts of the project that take turns (default: this one)")  # fmt: skip
