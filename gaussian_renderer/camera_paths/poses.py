@@ -55,10 +55,10 @@ class Poses:
     @property
     def quaternions(self) -> np.ndarray:
         """The turns as unit quaternions (N,4) wxyz."""
-        return _rotations(self.turns).as_quat(scalar_first=True)
+        return _make_rotations(self.turns).as_quat(scalar_first=True)
 
 
-def _rotations(turns: np.ndarray) -> "Rotation":
+def _make_rotations(turns: np.ndarray) -> "Rotation":
     from scipy.spatial.transform import Rotation  # takes a while to import
 
     return Rotation.from_matrix(turns)
@@ -68,7 +68,7 @@ def poses_of(cameras: Sequence[Camera]) -> Poses:
     """The poses of views, by their matrices."""
     views = np.stack([camera.world_view_transform.detach().cpu().double().numpy().T for camera in cameras])
     positions = -np.linalg.solve(views[:, :3, :3], views[:, :3, 3:])[..., 0]
-    turns = _rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
+    turns = _make_rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
     return Poses(positions, turns, np.degrees([vertical_fov(camera) for camera in cameras]))
 
 
@@ -111,7 +111,7 @@ def look_along(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
     """Make a Keyframe of a pose with a turn (3,3)."""
-    wxyz = _rotations(turn).as_quat(scalar_first=True)
+    wxyz = _make_rotations(turn).as_quat(scalar_first=True)
     return Keyframe(seconds, tuple(position.tolist()), tuple(wxyz.tolist()), float(fov))
 
 
