@@ -27,7 +27,7 @@ _OF_COMMAND = {name: name for name in ("convert", "doctor", "export")} | {"full_
 _USED = re.compile(rf"^(?:from|import) (applications\.\w+|benchmarks|{'|'.join(_OF_COMMAND)})\b", re.MULTILINE)
 
 
-def _rooms(path: Path) -> set[str]:
+def _list_rooms(path: Path) -> set[str]:
     """The applications, and benchmarks, that a test imports, also by helpers of tests."""
     found, files, seen = set(), [path], set()
     while files:
@@ -46,7 +46,7 @@ def pytest_ignore_collect(collection_path: Path) -> bool | None:
     """
     if collection_path.suffix != ".py":
         return None
-    rooms = _rooms(collection_path)
+    rooms = _list_rooms(collection_path)
     deleted = any(not ROOT.joinpath(*room.split(".")).is_dir() for room in rooms)
     of_core = not rooms and ROOT / "tests" in collection_path.parents
     return True if deleted or (of_core and os.environ.get("GS_TESTS") == "applications") else None
@@ -121,6 +121,7 @@ def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[P
     shared = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "once"
 
     def made(name: str, make: Callable[[Path], object]) -> Path:
+        """Make the folder `name` with `make`, once for all test processes, and return its path."""
         folder, done = shared / name, shared / f"{name}.done"
         folder.parent.mkdir(parents=True, exist_ok=True)
         with FileLock(shared / f"{name}.lock"):

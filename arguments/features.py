@@ -44,7 +44,7 @@ class _Port(Option):
         group.add_argument(f"--{self.name}", **words).topic = self.topic  # type: ignore[arg-type, attr-defined]
 
 
-def _between(value: float) -> str | None:
+def _check_between(value: float) -> str | None:
     return None if 0 < value < 1 else "between 0 and 1, and neither of them"
 
 
@@ -124,7 +124,7 @@ FEATURES: dict[str, Options] = {
             help="mcmc: relocation and growth end before this step; --densify_until_iter has no effect then"),
         Option("mcmc_growth", 0.05, origin=_PAPER, check=within(0, 1),
             help="mcmc: growth in every densification, as a part of the number of Gaussians"),
-        Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_between,
+        Option("mcmc_min_opacity", 0.005, origin=_PAPER, check=_check_between,
             help="mcmc: a Gaussian of this opacity or less is moved to another one"),
         Option("mcmc_noise", 500_000.0, origin=_PAPER, check=within(0, 1e9),
             help="mcmc: factor of the noise that moves Gaussians in every step, times the learning rate of positions"),
@@ -132,7 +132,7 @@ FEATURES: dict[str, Options] = {
             help="mcmc: weight of the mean opacity in the loss; higher: more Gaussians fade and are moved"),
         Option("mcmc_scale_reg", 0.01, origin=_PAPER, check=at_least(0),
             help="mcmc: weight of the mean scale (world units) in the loss; higher: smaller Gaussians"),
-        Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_between,
+        Option("mcmc_init_opacity", 0.5, origin=_RELEASED, check=_check_between,
             help="mcmc: opacity of the Gaussians that are made from points"),
         Option("mcmc_init_scale", 0.0, origin=_RELEASED, check=at_least(0),
             help="mcmc: scale of the Gaussians that are made from points, as a part of the distance to their "

@@ -11,7 +11,7 @@ from groundwork.files.json_files import MODEL_JSON
 from utils.system_utils import UserError
 
 
-def _resolution(value: int) -> str | None:
+def _check_resolution(value: int) -> str | None:
     return None if value == -1 or value > 0 else "-1, 1, 2, 4, 8 or a width in pixels"
 
 
@@ -33,7 +33,7 @@ class ModelParams(OptionTable):
         Option("images", "images", short="i", stored=CFG_ARGS, topic="data",
             help="folder of the photos inside the scene folder, in place of that which a camera file names"),
         *options_of("model"),
-        Option("resolution", -1, short="r", check=_resolution, stored=CFG_ARGS, topic=MOST_NEEDED,
+        Option("resolution", -1, short="r", check=_check_resolution, stored=CFG_ARGS, topic=MOST_NEEDED,
             help="1, 2, 4, 8: divide the size of the photos by this; -1: keep their size, but at most 1600 pixels "
                  "wide; other values: width in pixels"),
         Option("white_background", False, short="w", stored=CFG_ARGS, topic="data",
@@ -88,7 +88,10 @@ class ModelParams(OptionTable):
         self._add_table(parser, sentinel, without)
 
     def extract(self, args: argparse.Namespace) -> GroupParams:
-        """Do as OptionTable.extract, and make source_path absolute. UserError for contradictory options."""
+        """Return the model options from parsed `args`, with defaults for missing ones and an absolute source_path.
+
+        An --appearance also sets the flag that stands for it. UserError for invalid or contradictory options.
+        """
         values = super().extract(args)
         given = {name: getattr(values, name, "") for name in ("init_type", "init_pcd_path", "init_ply")}
         starts = [f"--{name} {value}" for name, value in given.items() if value not in ("", "sfm")]

@@ -74,9 +74,13 @@ class Option:
         return f"_{self.name}" if self.short else self.name
 
     def add_to(self, group: argparse._ActionsContainer, sentinel: bool) -> None:
+        """Add this option to a group of an argument parser.
+
+        sentinel: the parser's default is None, so that a missing option can be told from one given its default.
+        """
         flags = [f"--{self.name}"] + ([f"-{self.short}"] if self.short else [])
         default = None if sentinel else self.default
-        text = f"{self.help} (default: {self._shown_default(sentinel)})" if self.help else f"default: {self._shown()}"
+        text = f"{self.help} (default: {self._tell_default(sentinel)})" if self.help else f"default: {self._format()}"
         if isinstance(self.default, bool):
             kind: dict[str, Any] = {"action": "store_true"}
         else:
@@ -85,17 +89,17 @@ class Option:
         for name in ("ours", "topic", "above_zero"):  # for the parsers of arguments/
             setattr(action, name, getattr(self, name))
 
-    def _shown(self) -> str:
+    def _format(self) -> str:
         return "off" if self.default is False else "none" if self.default == "" else str(self.default)
 
-    def _shown_default(self, sentinel: bool) -> str:
+    def _tell_default(self, sentinel: bool) -> str:
         """Return a text about the value that counts if the option is not given.
 
         sentinel: true for a command that loads a model.
         """
         if sentinel and (self.loaded or self.stored):
             return self.loaded or "that of the model"
-        return self.unset or f"{self._shown()}; {self.origin}"
+        return self.unset or f"{self._format()}; {self.origin}"
 
     def _metavar(self) -> str | None:
         if choices := getattr(self.check, "choices", ()):

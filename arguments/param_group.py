@@ -27,10 +27,11 @@ class OptionParser(argparse.ArgumentParser):
     def parse_args(self, *words: Any, **more: Any) -> argparse.Namespace:
         args, unknown = self.parse_known_args(*words, **more)
         if unknown:
-            self.error(self._unknown(unknown))
+            self.error(self._describe_unknown(unknown))
         return args
 
-    def _unknown(self, words: list[str]) -> str:
+    def _describe_unknown(self, words: list[str]) -> str:
+        """Return the message for words of the command line that belong to no option, with a likely correction."""
         word = next((word for word in words if word.startswith("-")), words[0])
         if not word.startswith("-"):
             ways = [f"a {kind} by {flag}" for flag, kind in _FOLDERS.items() if flag in self._option_string_actions]
@@ -44,6 +45,7 @@ class OptionParser(argparse.ArgumentParser):
         return f"there is no option {word}" + (f"; did you mean {near[0]}?" if near else "")
 
     def _get_value(self, action: argparse.Action, text: str) -> Any:
+        """Convert the text of an option, as argparse does, with messages that name the expected kind of value."""
         path = None if os.name == "nt" or os.path.exists(text) else _OF_WINDOWS.fullmatch(text)
         if path and (path[2][0] in "\\/" or action.dest in ("source_path", "model_path")):
             below = path[2].replace("\\", "/").lstrip("/") if path[2][0] in "\\/" else "..."
@@ -87,13 +89,17 @@ class ParamGroup:
     def __init__(
         self, parser: argparse.ArgumentParser, name: str, fill_none: bool = False, without: Collection[str] = ()
     ) -> None:
+        """Add the options of this group to a parser, under the title `name`.
+
+        fill_none: missing options get None instead of their defaults. without: names of options to leave out.
+        """
         group = parser.add_argument_group(name)
         for option in self._options():
             if option.name not in without:
                 option.add_to(group, fill_none)
 
     def _options(self) -> list[Option]:
-        return [_of_attribute(name, value) for name, value in vars(self).items()]
+        return [_make_option(name, value) for name, value in vars(self).items()]
 
     def extract(self, args: argparse.Namespace) -> GroupParams:
         """Return this group's values from `args`; absent or None means the default."""
@@ -104,7 +110,7 @@ class ParamGroup:
         return values
 
 
-def _of_attribute(name: str, value: Any) -> Option:
+def _make_option(name: str, value: Any) -> Option:
     plain = name.removeprefix("_")
     return Option(plain, value, "", short=plain[0] if name.startswith("_") else None)
 
@@ -131,16 +137,18 @@ class OptionTable(ParamGroup):
         ParamGroup.__init__(self, parser, self.title, sentinel, without)
 
     def _options(self) -> list[Option]:
+        """List the options of this group; one whose attribute has another value than the table's has no help and
+        checks."""
         table = {option.attribute: option for option in self.options}
         options = []
         for name, value in vars(self).items():
             known = table.get(name)
             same = known and type(value) is type(known.default) and value == known.default
-            options.append(known if same else _of_attribute(name, value))
+            options.append(known if same else _make_option(name, value))
         return options
 
     def extract(self, args: argparse.Namespace) -> GroupParams:
-        """Do as ParamGroup.extract. UserError for invalid values."""
+        """Return this group's values from `args`, defaults for missing ones. UserError for invalid values."""
         values = super().extract(args)
         for option in self._options():
             if option in self.options:

@@ -149,12 +149,12 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
     stored = {} if is_new else read_stored_options(args.model_path)
     other = other_scene(stored.get("source_path", ""), typed.get("source_path", ""))
     drawn = {name: value for name, value in typed.items() if not (is_new and name == "eval")}
-    marks = _marks(_IN_CFG_ARGS | _IN_MODEL_JSON | stored, drawn)
+    marks = _list_marks(_IN_CFG_ARGS | _IN_MODEL_JSON | stored, drawn)
     known = {"typed_sh_degree": typed.get("sh_degree"), "other_scene": other, "marks": "".join(marks)}
     return argparse.Namespace(**vars(args) | stored | typed | known)
 
 
-def _marks(stored: Mapping[str, Value], typed: Mapping[str, Value]) -> Iterator[str]:
+def _list_marks(stored: Mapping[str, Value], typed: Mapping[str, Value]) -> Iterator[str]:
     """The ends of names: of each option that was typed and is not as stored, sorted; as in _r2."""
     for name in sorted(stored.keys() & typed.keys() - _UNSEEN):
         value = typed[name]

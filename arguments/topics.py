@@ -21,6 +21,7 @@ class TopicParser(OptionParser):
     shows_all = False
 
     def __init__(self, **more: Any) -> None:
+        """Make the parser with its options of help, which are among those MOST_NEEDED."""
         super().__init__(**more)
         nowhere = {"dest": argparse.SUPPRESS, "default": argparse.SUPPRESS}
         action = self.add_argument(
@@ -38,6 +39,7 @@ class TopicParser(OptionParser):
         return found
 
     def format_help(self) -> str:
+        """Return the help text by topics: all options, or those most needed and the names of the other topics."""
         formatter = self._get_formatter()
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)

@@ -75,8 +75,8 @@ def render(
     gaussians, raw = model_inputs(viewpoint_camera, pc, pipe, scaling_modifier, separate_sh, override_color)
     if gaussians.sh_rest is not None and pc.active_sh_degree == 0 and not want_inactive_bands:
         gaussians = gaussians._replace(sh_rest=gaussians.sh_rest.detach()[:, :0])
-    viewspace_points = _screen_points(*gaussians)
-    rasterizer = rasterizer_of(pc) if features is None else partial(_with_features, rasterizer_of(pc), features)
+    viewspace_points = _make_screen_points(*gaussians)
+    rasterizer = rasterizer_of(pc) if features is None else partial(_rasterize_features, rasterizer_of(pc), features)
     result = rasterizer(
         means2d=viewspace_points,
         settings=rasterizer_settings(viewpoint_camera, pc, pipe, bg_color, scaling_modifier),
@@ -104,7 +104,7 @@ class _Featured(NamedTuple):
     features: Tensor
 
 
-def _with_features(
+def _rasterize_features(
     rasterizer: Callable,
     features: Tensor,
     *,
@@ -112,6 +112,10 @@ def _with_features(
     want_inverse_depth: bool,
     **given,
 ) -> _Featured:
+    """Rasterize colours and the features (N, C) in one pass, as an image of 3 + C channels, and split the result.
+
+    ValueError for a model that is divided among processes.
+    """
     if rasterizer is not rasterize:
         raise ValueError("features need a model that is not divided among processes")
     behind = torch.nn.functional.pad(settings.bg.reshape(-1), (0, features.shape[-1]))
@@ -119,15 +123,15 @@ def _with_features(
     return _Featured(found.image[:3], found.radii, None, found.image[3:])
 
 
-def _screen_points(xyz: Tensor, *others: Tensor | None) -> Tensor:
+def _make_screen_points(xyz: Tensor, *others: Tensor | None) -> Tensor:
     """Zeros (N, 3) that take a gradient if one of the tensors does."""
-    points = _zero(xyz.device, xyz.dtype).expand_as(xyz)
+    points = _make_zero(xyz.device, xyz.dtype).expand_as(xyz)
     differentiated = any(x is not None and x.requires_grad for x in (xyz, *others))
     return points.requires_grad_(torch.is_grad_enabled() and differentiated)
 
 
 @cache
-def _zero(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _make_zero(device: torch.device, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):  # so that training can use it after a render in inference mode
         return torch.zeros((), device=device, dtype=dtype)
 
@@ -147,6 +151,7 @@ class Drawn:
     def __init__(
         self, drawing: Drawing, scene: Scene, background: Tensor, want_depth: bool, awake: Tensor | None = None
     ) -> None:
+        """Keep a drawn view and what its gradients need. awake: the blocks of Gaussians that take part, None: all."""
         self.image, self.depth = drawing.color, drawing.inverse_depth if want_depth else None
         self.radii, self.blend_depth = drawing.radii, drawing.last
         self._drawing, self._scene, self._background, self._awake = drawing, scene, background, awake
@@ -208,7 +213,7 @@ def draw(
     by_bands: with a model divided among ranks, each rank needs only the pixels for the loss of its band.
     bands: with a divided model, the bands of earlier steps; the camera's uid stands for the view.
     sleeping: the model's sleeping blocks; those that the view may show wake.
-    now: as for `Drawn.step`.
+    now: numbers of the step on the GPU, for a step that a CUDA graph repeats (`Sleeping.wake`); else None.
     """
     gaussians, raw = model_inputs(camera, pc, pipe, scaling)
     scene = scene_arguments(gaussians, rasterizer_settings(camera, pc, pipe, background, scaling), raw)
@@ -250,8 +255,8 @@ def model_inputs(
     override_color: Tensor | None = None,
 ) -> tuple[Gaussians, bool]:
     """The rasterizer's inputs for a view of a model, and whether they are raw. Arguments as for `render`."""
-    geometry, raw = _geometry(pc, pipe.compute_cov3D_python, scaling)
-    colors = _colors(pc, pipe.convert_SHs_python, camera, separate_sh, override_color)
+    geometry, raw = _choose_geometry(pc, pipe.compute_cov3D_python, scaling)
+    colors = _choose_colors(pc, pipe.convert_SHs_python, camera, separate_sh, override_color)
     return Gaussians(pc.get_xyz, **geometry, **colors), raw
 
 
@@ -259,7 +264,7 @@ def rasterizer_settings(
     camera: Camera | MiniCam, pc: GaussianModel, pipe: argparse.Namespace, background: Tensor, scaling: float = 1.0
 ) -> GaussianRasterizationSettings:
     """The rasterizer's settings for a view of a model; arguments as for `render`."""
-    view, full = _enlarged(camera, pc)
+    view, full = _enlarge_matrices(camera, pc)
     return GaussianRasterizationSettings(
         image_height=int(camera.image_height),
         image_width=int(camera.image_width),
@@ -279,7 +284,7 @@ def rasterizer_settings(
     )
 
 
-def _enlarged(camera: Camera | MiniCam, pc: GaussianModel) -> tuple[Tensor, Tensor]:
+def _enlarge_matrices(camera: Camera | MiniCam, pc: GaussianModel) -> tuple[Tensor, Tensor]:
     """The camera's matrices in a frame that is larger than the world's by a model's enlargement.
 
     Only the nearest depth that is drawn changes.
@@ -315,7 +320,7 @@ def photo_name(camera: Camera | MiniCam) -> str | None:
     return getattr(camera, "image_name", None) if name is None else name
 
 
-def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tuple[dict[str, Tensor], bool]:
+def _choose_geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tuple[dict[str, Tensor], bool]:
     """Return shapes and opacities, and whether they are raw, so that the kernels activate them.
 
     The kernels are faster and give the same bits for any number of threads. A model with activations of its own, or of
@@ -329,9 +334,10 @@ def _geometry(pc: GaussianModel, in_python: bool, scaling_modifier: float) -> tu
     return {"opacities": pc.get_opacity, "scales": pc.get_scaling, "rotations": pc.get_rotation}, False
 
 
-def _colors(
+def _choose_colors(
     pc: GaussianModel, in_python: bool, camera: Camera | MiniCam, separate_sh: bool, override_color: Tensor | None
 ) -> dict[str, Tensor]:
+    """Choose the rasterizer's colour arguments: `override_color` (N, 3), colours computed here, or SH coefficients."""
     check_flags(convert_SHs_python=in_python, separate_sh=separate_sh)
     if override_color is not None:
         return {"colors": override_color}

@@ -25,10 +25,12 @@ def free_view(
     """
     fov_x = 2 * math.atan(math.tan(fov_y / 2) * width / height)
     project = projection(ZNEAR, ZFAR, fov_x, fov_y)
-    return _view(width, height, fov_y, fov_x, rotation_matrix(wxyz), np.asarray(position, np.float64), project, device)
+    return _make_view(
+        width, height, fov_y, fov_x, rotation_matrix(wxyz), np.asarray(position, np.float64), project, device
+    )
 
 
-def _view(
+def _make_view(
     width: int,
     height: int,
     fov_y: float,
@@ -68,7 +70,7 @@ def neighbours(cameras: Sequence[Camera], nearest: int = NEAREST) -> list[tuple[
     count = len(cameras)
     if count < 2:
         return []
-    distances = _distances(cameras)
+    distances = _measure_distances(cameras)
     tree = minimum_spanning_tree(1 + distances)  # a weight of 0 would be no edge
     pairs = {(min(i, j), max(i, j)) for i, j in np.argwhere(tree.toarray()).tolist()}
     np.fill_diagonal(distances, np.inf)
@@ -77,7 +79,7 @@ def neighbours(cameras: Sequence[Camera], nearest: int = NEAREST) -> list[tuple[
     return sorted(pairs)
 
 
-def _distances(cameras: Sequence[Camera]) -> np.ndarray:
+def _measure_distances(cameras: Sequence[Camera]) -> np.ndarray:
     """(N, N) distances of `neighbours`."""
     centers = np.array([camera_center(camera.R, camera.T) for camera in cameras])
     turns = np.array([camera.R for camera in cameras]).reshape(-1, 9)
@@ -97,10 +99,12 @@ def views_between(first: Camera, second: Camera) -> list[MiniCam]:
     Positions, focal lengths and principal points are interpolated linearly, orientations along the shortest rotation
     (slerp). Where the sizes differ, the larger width and height count.
     """
-    return [_between(first, second, fraction) for fraction in FRACTIONS]
+    return [_interpolate_view(first, second, fraction) for fraction in FRACTIONS]
 
 
-def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
+def _interpolate_view(first: Camera, second: Camera, fraction: float) -> MiniCam:
+    """Interpolate the view between two cameras, from the first (fraction 0) to the second (1), a little wider than
+    both."""
     from scipy.spatial.transform import Rotation, Slerp
 
     def mixed(one: float, other: float) -> float:
@@ -115,4 +119,4 @@ def _between(first: Camera, second: Camera, fraction: float) -> MiniCam:
     shift_x = mixed(first.cx - first.image_width / 2, second.cx - second.image_width / 2)
     shift_y = mixed(first.cy - first.image_height / 2, second.cy - second.image_height / 2)
     project = projection(ZNEAR, ZFAR, fovx, fovy, 2 * shift_x / width, 2 * shift_y / height)
-    return _view(width, height, fovy, fovx, turn, center, project, first.device)
+    return _make_view(width, height, fovy, fovx, turn, center, project, first.device)

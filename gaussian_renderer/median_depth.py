@@ -32,7 +32,10 @@ class Surface(NamedTuple):
 
 @torch.no_grad()
 def surface_of(camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace) -> Surface:
-    """Compute the median depth and the colours, over black, of a view without a lens."""
+    """Draw the median depth (H, W) and the colours (3, H, W), over black, of a view by a pinhole camera.
+
+    pipe: the pipeline options.
+    """
     means = gaussians.get_xyz
     clip = means @ camera.full_proj_transform[:, [0, 1, 3]][:3] + camera.full_proj_transform[3, [0, 1, 3]]
     depths = clip[:, 2].contiguous()
@@ -48,11 +51,11 @@ def surface_of(camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argpars
     features[rows, slabs, 0], features[rows, slabs, 1] = 1, depths
     options = {"want_depth": False, "want_visibility": False, "features": features.flatten(1)}
     drawn = render(camera, gaussians, pipe, means.new_zeros(3), **options)
-    return Surface(_median(*drawn["features"].unflatten(0, (SLABS, 2)).unbind(1)), drawn["render"])
+    return Surface(_compute_median(*drawn["features"].unflatten(0, (SLABS, 2)).unbind(1)), drawn["render"])
 
 
-def _median(weights: Tensor, depths: Tensor) -> Tensor:
-    """The median depth (H, W) from the sums (SLABS, H, W) of weights, and of weights times depths."""
+def _compute_median(weights: Tensor, depths: Tensor) -> Tensor:
+    """Compute the median depth (H, W) from the sums (SLABS, H, W) of weights, and of weights times depths."""
     reached = weights.cumsum(0)
     found = (reached < _HALF).sum(0, keepdim=True).clamp_max(SLABS - 1)
     mean = depths.gather(0, found) / weights.gather(0, found)

@@ -27,12 +27,12 @@ def explain_memory_errors(
         if not is_out_of_memory(error):
             raise
         raise UserError(
-            f"{what} ran out of memory ({_situation(error, gaussians, cameras)}); {remedy}, or free memory that other "
-            "programs use"
+            f"{what} ran out of memory ({_describe_situation(error, gaussians, cameras)}); {remedy}, or free memory "
+            "that other programs use"
         ) from error
 
 
-def _situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam]) -> str:
+def _describe_situation(error: BaseException, gaussians: GaussianModel, cameras: Sequence[Camera | MiniCam]) -> str:
     """The memory asked for and free, the number of Gaussians, and the size of the largest view."""
     parts = [describe_shortage(error, gaussians.get_xyz.device), f"{len(gaussians):,} Gaussians"]
     if cameras:

@@ -104,7 +104,7 @@ def try_connect() -> None:
         return
     conn = accepted
     _viewer = _Viewer(since=time.monotonic())
-    tqdm.write(f"viewer {_name()} connected", file=sys.stdout)
+    tqdm.write(f"viewer {_name_viewer()} connected", file=sys.stdout)
 
 
 def has_request(seconds: float = 0.0) -> bool:
@@ -131,7 +131,7 @@ def read() -> dict[str, Any]:
 
     ViewerLost, with a line on stderr, once the connection has ended; UserError while nobody is connected.
     """
-    with _connection():
+    with _drop_viewer_on_error():
         if not readable(conn, None if wants_wait(last=False) else PATIENCE):
             raise ViewerLost(f"it has sent nothing for {PATIENCE:g} s")
         return decode(receive_message(conn))
@@ -140,7 +140,7 @@ def read() -> dict[str, Any]:
 def receive_request() -> Request | None:
     """Wait for the viewer's next request; None for a request without a frame. Errors as in `read`."""
     message = read()
-    with _connection():
+    with _drop_viewer_on_error():
         request = parse(message)
     _viewer.has_asked = True
     if request is not None:
@@ -162,7 +162,7 @@ def receive() -> tuple[MiniCam | None, bool | None, bool | None, bool | None, bo
 
 def send(message_bytes: bytes | memoryview | None, verify: str) -> None:
     """Answer a request: the frame's bytes (H, W, 3), None without one, and the dataset's path. Errors as in `read`."""
-    with _connection():
+    with _drop_viewer_on_error():
         send_message(conn, b"" if message_bytes is None else message_bytes, os.fsencode(verify))
 
 
@@ -171,7 +171,7 @@ def disconnect(fault: str | None = None) -> None:
     global conn, addr
     if conn is None:
         return
-    name = _name()
+    name = _name_viewer()
     conn.close()
     conn = addr = None
     if fault is None:
@@ -181,7 +181,7 @@ def disconnect(fault: str | None = None) -> None:
 
 
 @contextlib.contextmanager
-def _connection() -> Iterator[None]:
+def _drop_viewer_on_error() -> Iterator[None]:
     """Disconnect the viewer at an error of its own inside the block."""
     if conn is None:
         raise UserError("no viewer is connected; call network_gui.try_connect() until `conn` is not None")
@@ -198,5 +198,5 @@ def _connection() -> Iterator[None]:
         raise ViewerLost(str(error)) from error
 
 
-def _name() -> str:
+def _name_viewer() -> str:
     return ":".join(map(str, addr[:2])) if addr else "without an address"

@@ -63,20 +63,20 @@ def parse(message: dict[str, Any]) -> Request | None:
     BadMessage for a field that is missing, of another type, not finite or out of range, and for a view matrix that is
     singular, mirrored or sheared. A scale in the matrix is divided out.
     """
-    width, height = (_size(message, f"resolution_{axis}") for axis in "xy")
+    width, height = (_read_size(message, f"resolution_{axis}") for axis in "xy")
     if width == 0 or height == 0:
         return None
     if not (1 <= width <= MOST_SIDE and 1 <= height <= MOST_SIDE and width * height <= MOST_PIXELS):
         raise BadMessage(f"its resolution is not within 1 to {MOST_SIDE} a side and {MOST_PIXELS:,} pixels")
-    fov_x, fov_y = (_number(message, f"fov_{axis}") for axis in "xy")
+    fov_x, fov_y = (_read_number(message, f"fov_{axis}") for axis in "xy")
     if not (0 < fov_x < math.pi and 0 < fov_y < math.pi):
         raise BadMessage("its fov_x or fov_y is not between 0 and pi")
-    z_near, z_far = (_number(message, f"z_{end}") for end in ("near", "far"))
-    scaling = _number(message, "scaling_modifier")
+    z_near, z_far = (_read_number(message, f"z_{end}") for end in ("near", "far"))
+    scaling = _read_number(message, "scaling_modifier")
     if not 0 <= scaling <= MOST_SCALING:
         raise BadMessage(f"its scaling_modifier is not within 0 to {MOST_SCALING:g}")
-    flags = {name: _flag(message, name) for name in ("shs_python", "rot_scale_python", "train", "keep_alive")}
-    view, view_projection = (_matrix(message, name) for name in ("view_matrix", "view_projection_matrix"))
+    flags = {name: _read_flag(message, name) for name in ("shs_python", "rot_scale_python", "train", "keep_alive")}
+    view, view_projection = (_read_matrix(message, name) for name in ("view_matrix", "view_projection_matrix"))
     view[:, 1:3] *= -1  # the viewer's y and z axes point the other way
     view_projection[:, 1] *= -1
     _divide_scale_out(view)
@@ -87,6 +87,7 @@ def parse(message: dict[str, Any]) -> Request | None:
 
 
 def _divide_scale_out(view: Tensor) -> None:
+    """Divide the scale out of a transposed view matrix (4, 4), in place. BadMessage where it is no similarity."""
     try:
         turn, shift = rigid_pose(view[:3, :3].numpy(), view[3, :3].numpy(), "the viewer")
     except UserError as error:
@@ -94,31 +95,32 @@ def _divide_scale_out(view: Tensor) -> None:
     view[:3, :3], view[3, :3] = torch.from_numpy(turn), torch.from_numpy(shift)
 
 
-def _field(message: dict[str, Any], name: str) -> Any:
+def _read_field(message: dict[str, Any], name: str) -> Any:
     if name not in message:
         raise BadMessage(f"its message has no {name}")
     return message[name]
 
 
-def _size(message: dict[str, Any], name: str) -> int:
-    value = _field(message, name)
+def _read_size(message: dict[str, Any], name: str) -> int:
+    value = _read_field(message, name)
     if type(value) is not int:
         raise BadMessage(f"its {name} is not a whole number")
     return value
 
 
-def _flag(message: dict[str, Any], name: str) -> bool:
-    value = _field(message, name)
+def _read_flag(message: dict[str, Any], name: str) -> bool:
+    value = _read_field(message, name)
     if type(value) not in (int, bool) or value not in (0, 1):
         raise BadMessage(f"its {name} is neither 0 nor 1")
     return bool(value)
 
 
-def _number(message: dict[str, Any], name: str) -> float:
-    return _finite(_field(message, name), name)
+def _read_number(message: dict[str, Any], name: str) -> float:
+    return _check_finite(_read_field(message, name), name)
 
 
-def _finite(value: Any, name: str) -> float:
+def _check_finite(value: Any, name: str) -> float:
+    """Return a number of a message as a float. BadMessage, with its name, if it is no finite number."""
     if type(value) not in (int, float):
         raise BadMessage(f"its {name} is not a number")
     if not abs(value) <= sys.float_info.max:  # also a whole number that no float can hold
@@ -126,12 +128,12 @@ def _finite(value: Any, name: str) -> float:
     return float(value)
 
 
-def _matrix(message: dict[str, Any], name: str) -> Tensor:
+def _read_matrix(message: dict[str, Any], name: str) -> Tensor:
     """Read sixteen numbers, row by row, as (4,4) float32 on the CPU."""
-    values = _field(message, name)
+    values = _read_field(message, name)
     if type(values) is not list or len(values) != 16:
         raise BadMessage(f"its {name} is not a list of 16 numbers")
-    matrix = torch.tensor([_finite(value, name) for value in values], dtype=torch.float64, device="cpu")
+    matrix = torch.tensor([_check_finite(value, name) for value in values], dtype=torch.float64, device="cpu")
     matrix = matrix.to(torch.float32).view(4, 4)
     if not matrix.isfinite().all():
         raise BadMessage(f"its {name} is not finite")

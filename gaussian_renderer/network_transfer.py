@@ -43,13 +43,14 @@ def readable(sock: socket.socket, seconds: float | None = 0.0) -> bool:
     """
     left = math.inf if seconds is None else seconds
     while left > _LOOK:
-        if _readable(sock, _LOOK):
+        if _wait_for_data(sock, _LOOK):
             return True
         left -= _LOOK
-    return _readable(sock, left)
+    return _wait_for_data(sock, left)
 
 
-def _readable(sock: socket.socket, seconds: float) -> bool:
+def _wait_for_data(sock: socket.socket, seconds: float) -> bool:
+    """Wait at most `seconds` for data on a socket, and tell whether there are any."""
     if not hasattr(select, "poll"):
         return bool(select.select([sock], [], [], seconds)[0])
     poll = select.poll()
@@ -83,7 +84,7 @@ def _receive(conn: socket.socket, count: int, end: float) -> bytes:
     """Receive `count` bytes, or fewer if the connection ends before."""
     received = bytearray()
     while len(received) < count:
-        with _limited(conn, end):
+        with _limit_time(conn, end):
             part = conn.recv(count - len(received))
         if not part:
             break
@@ -94,12 +95,12 @@ def _receive(conn: socket.socket, count: int, end: float) -> bytes:
 def _send(conn: socket.socket, data: bytes | memoryview, end: float) -> None:
     rest = memoryview(data).cast("B")
     while rest:
-        with _limited(conn, end):
+        with _limit_time(conn, end):
             rest = rest[conn.send(rest[:_PART]) :]
 
 
 @contextlib.contextmanager
-def _limited(conn: socket.socket, end: float) -> Iterator[None]:
+def _limit_time(conn: socket.socket, end: float) -> Iterator[None]:
     """Let a call in the block take SILENCE seconds, but not past the time `end`; raise a failure as ViewerLost."""
     try:
         left = end - time.monotonic()

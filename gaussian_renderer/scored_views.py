@@ -32,6 +32,7 @@ class ScoredViews:
         halves: bool,
         draw: Callable[[Camera, GaussianModel], Tensor] | None = None,
     ) -> None:
+        """Keep how views are drawn. halves: scores are of right halves. draw: replaces the render of a whole view."""
         self.pipe = pipe
         self._background = background
         self.halves = halves

@@ -40,6 +40,7 @@ _MODULES = ("cameras", "colmap_loader", "dataset_readers", "gaussian_model")
 
 
 def __getattr__(name: str) -> object:
+    """Import a module, or a name that lives in one, when it is first read."""
     if name in _MODULES:
         return import_module(f"scene.{name}")
     if name not in _HOMES:

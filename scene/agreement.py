@@ -70,7 +70,7 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
     compared = sorted(find_overlaps(model, database), key=lambda pair: -pair.empty)
     alike = [pair[:2] for pair in compared if pair.is_unmatched]
     return verdict(list(pairs_of(model, database))) | {
-        "bound": len(largest_component(_linked(database))),
+        "bound": len(largest_component(_list_linked_pairs(database))),
         "rotation": rotation_error(database),
         "alike": find_cover(alike),
         "alike_pair": alike[0] if alike else None,
@@ -92,7 +92,7 @@ def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
     for pair in pairs:
         one, other = sorted((member[pair.first], member[pair.second]))
         if one == 0 < other:
-            votes[other] = votes.get(other, 0.0) + _vote(pair)
+            votes[other] = votes.get(other, 0.0) + _weigh_pair(pair)
     matches = sum(pair.matches for pair in pairs)
     wrong = sum(pair.matches for pair in pairs if pair.contradicts)
     return {
@@ -110,7 +110,7 @@ def pairs_of(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
     database = pycolmap.Database.open(path)
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     images = {one.image_id: posed[one.name] for one in database.read_all_images() if one.name in posed}
-    rays = {number: _rays(image.camera, database.read_keypoints(number)) for number, image in images.items()}
+    rays = {number: _compute_rays(image.camera, database.read_keypoints(number)) for number, image in images.items()}
     for number, geometry in zip(*database.read_two_view_geometries(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(number)
         if first in images and second in images and int(geometry.config) in _CALIBRATED:
@@ -135,7 +135,11 @@ def pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
             seen[image][number] = place
             shared[image].update(other for other in places if other != image)
     chosen = {(min(i, j), max(i, j)) for i in images for j, n in shared[i].most_common(_SHARING) if n >= FEWEST}
-    rays = {i: _rays(image.camera, np.array([p.xy for p in image.points2D])) for i, image in images.items() if seen[i]}
+    rays = {
+        i: _compute_rays(image.camera, np.array([p.xy for p in image.points2D]))
+        for i, image in images.items()
+        if seen[i]
+    }
     for first, second in sorted(chosen):
         both = sorted(seen[first].keys() & seen[second].keys())
         matched = (rays[i][[seen[i][number] for number in both]] for i in (first, second))
@@ -152,7 +156,7 @@ def judge_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, see
     moved = other.cam_from_world() * one.cam_from_world().inverse()
     x, y, z = moved.translation / max(float(np.linalg.norm(moved.translation)), 1e-12)
     essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ moved.rotation.matrix()
-    scale = (_pixels(one.camera) + _pixels(other.camera)) / 2
+    scale = (_count_pixels_a_radian(one.camera) + _count_pixels_a_radian(other.camera)) / 2
     errors = (float(np.median(error)) * scale for error in (angles(essential, rays, seen), own_angles(rays, seen)))
     side = max(one.camera.width, one.camera.height)
     behind = share_behind(moved.rotation.matrix(), np.array([x, y, z]), rays, seen)
@@ -205,7 +209,7 @@ def consistent_groups(pairs: Iterable[Pair]) -> list[list[str]]:
     votes: dict[str, dict[str, float]] = {}
     for pair in pairs:
         for one, other in ((pair.first, pair.second), (pair.second, pair.first)):
-            votes.setdefault(one, {})[other] = _vote(pair)
+            votes.setdefault(one, {})[other] = _weigh_pair(pair)
     groups = {name: [name] for name in votes}
     heap = [(-vote, one, other) for one, row in votes.items() for other, vote in row.items() if vote > 0]
     heapq.heapify(heap)
@@ -241,7 +245,8 @@ def largest_component(links: Iterable[tuple[Any, Any]]) -> set[Any]:
     return largest
 
 
-def _linked(path: str) -> list[tuple[int, int]]:
+def _list_linked_pairs(path: str) -> list[tuple[int, int]]:
+    """List the pairs (id, id) of photos with at least 2 * FEWEST verified matches in a COLMAP database."""
     database = pycolmap.Database.open(path)
     counted = zip(*database.read_two_view_geometry_num_inliers(), strict=True)
     links = [pycolmap.pair_id_to_image_pair(number) for number, count in counted if count >= 2 * FEWEST]
@@ -249,15 +254,15 @@ def _linked(path: str) -> list[tuple[int, int]]:
     return links
 
 
-def _vote(pair: Pair) -> float:
+def _weigh_pair(pair: Pair) -> float:
     return min(pair.matches, _HEARD) * (-1.0 if pair.contradicts else 1.0)
 
 
-def _rays(camera: pycolmap.Camera, keypoints: Any) -> np.ndarray:
+def _compute_rays(camera: pycolmap.Camera, keypoints: Any) -> np.ndarray:
     rays = np.asarray(camera.cam_ray_from_img(places_of(keypoints)), float).reshape(-1, 3)
     return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def _pixels(camera: pycolmap.Camera) -> float:
+def _count_pixels_a_radian(camera: pycolmap.Camera) -> float:
     """Pixels of a radian in the middle of a photo."""
     return camera.mean_focal_length() if camera.focal_length_idxs() else camera.width / (2 * np.pi)

@@ -66,6 +66,7 @@ class Camera(View, nn.Module):
     __signature__ = SIGNATURE
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Make a camera from a CameraInfo, as View, or from the arguments of either release of the reference."""
         nn.Module.__init__(self)
         if not (args and isinstance(args[0], CameraInfo)):
             args, kwargs = parse_either_form(*args, **kwargs)
@@ -81,6 +82,7 @@ class Camera(View, nn.Module):
         self._pose += (self.trans, self.scale)
 
     def __setattr__(self, name: str, value: Any) -> None:
+        """Assign an attribute; a parameter that takes a property's place is registered as torch's modules do it."""
         if not isinstance(getattr(type(self), name, None), property):
             super().__setattr__(name, value)
             return
@@ -90,6 +92,7 @@ class Camera(View, nn.Module):
             self._parameters[name] = value  # torch would refuse the name, since a property has it
 
     def __delattr__(self, name: str) -> None:
+        """Delete an attribute; a property goes back to its computed value."""
         if isinstance(getattr(type(self), name, None), property):
             self._parameters.pop(name, None)
             object.__delattr__(self, name)
@@ -107,6 +110,7 @@ class Camera(View, nn.Module):
         return twin
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Camera":
+        """Copy the camera and its tensors; the copy shares the store of decoded photos."""
         twin = type(self).__new__(type(self))
         memo[id(self)] = twin
         twin.__setstate__(copy.deepcopy(self.__getstate__(), memo))
@@ -131,7 +135,7 @@ class Camera(View, nn.Module):
         if "pixels" in self._made:
             return self._made["pixels"]
         with torch.inference_mode(False):  # tensors of that mode count no versions
-            pixels = self._stored(self._source).to(self._photo_device)
+            pixels = self._load_pixels(self._source).to(self._photo_device)
             pixels = pixels.clone() if pixels.is_floating_point() else pixels.float() / 255
         if isinstance(self._source, InMemory) or self.images.keeps_floats:
             self._made["pixels"], self._made_version = pixels, pixels._version
@@ -144,10 +148,11 @@ class Camera(View, nn.Module):
 
     def _target(self, pixels: Tensor, background: Tensor) -> Tensor:
         if self._edited or not _OF_TARGET.isdisjoint(self._assigned):
-            return self._assigned_target(pixels, background.to(self.device))
+            return self._compute_assigned_target(pixels, background.to(self.device))
         return super()._target(pixels, background)
 
-    def _assigned_target(self, pixels: Tensor, background: Tensor) -> Tensor:
+    def _compute_assigned_target(self, pixels: Tensor, background: Tensor) -> Tensor:
+        """Return the target (3,H,W) float32 with assigned or changed colours and alpha over `background` (3,)."""
         colors = self.original_image.to(self.device, torch.float32)
         if "alpha_mask" in self._assigned:
             alpha = self.alpha_mask.to(self.device, torch.float32)
@@ -170,13 +175,15 @@ class Camera(View, nn.Module):
 
     @_assignable
     def alpha_mask(self) -> Tensor:
-        """The photo's alpha (1,H,W) float32 in [0,1] on the data device, ones without alpha; 0 outside `columns`.
+        """The photo's alpha (1,H,W) float32 in [0,1] on the data device, ones without alpha.
+
+        It is 0 outside `columns`, the columns of pixels that count in loss and scores (None: all).
 
         Assign another one rather than change it in place: it is made anew at each reading unless the photo has alpha.
         """
         pixels = self._float_pixels()
         alpha = pixels[3:] if pixels.shape[0] == 4 else None
-        return self._within_columns(alpha) if alpha is None or self.columns is not None else alpha
+        return self._mask_columns(alpha) if alpha is None or self.columns is not None else alpha
 
     @_assignable
     def depth_reliable(self) -> bool:
@@ -186,12 +193,12 @@ class Camera(View, nn.Module):
     @_assignable
     def invdepthmap(self) -> Tensor | None:
         """Inverse depth (1,H,W) float32 on the data device, 1 / world units, 0 where unknown; None without a map."""
-        depth = None if self._depth is None else self._stored(self._depth).to(self._photo_device)
+        depth = None if self._depth is None else self._load_pixels(self._depth).to(self._photo_device)
         return depth.nan_to_num(0.0) if self.depth_has_gaps else depth
 
     @property
     def target_inverse_depth(self) -> Tensor | None:
-        """`invdepthmap`, on `device`."""
+        """Inverse depth (1,H,W) to train on, 1 / world units, on `device`: an assigned `invdepthmap`, or the map's."""
         if "invdepthmap" not in self._assigned:
             return super().target_inverse_depth
         depth = self._assigned["invdepthmap"]
@@ -199,15 +206,17 @@ class Camera(View, nn.Module):
 
     @_assignable
     def depth_mask(self) -> Tensor | None:
-        """(1,H,W) float32 on the data device: 1 where the inverse depth counts, 0 outside `columns`, where it is
-        unknown and for an unreliable map; None without a map.
+        """The pixels whose inverse depth counts, (1,H,W) float32 on the data device; None without a map.
+
+        1 where it counts; 0 where it is unknown, outside `columns` (the columns of pixels that count in loss and
+        scores, None: all), and everywhere for an unreliable map.
         """
         if self._depth is None:
             return None
-        mask = self._within_columns() * float(self._reliable)
-        return mask * ~self._stored(self._depth).to(mask).isnan() if self.depth_has_gaps else mask
+        mask = self._mask_columns() * float(self._reliable)
+        return mask * ~self._load_pixels(self._depth).to(mask).isnan() if self.depth_has_gaps else mask
 
-    def _within_columns(self, values: Tensor | None = None) -> Tensor:
+    def _mask_columns(self, values: Tensor | None = None) -> Tensor:
         """Values (1,H,W), ones by default, in the columns that count; 0 elsewhere."""
         mask = torch.zeros(1, *self._size[::-1], device=self._photo_device)
         columns = slice(None) if self.columns is None else self.columns
@@ -229,6 +238,10 @@ class MiniCam:
         world_view_transform: Tensor,
         full_proj_transform: Tensor,
     ) -> None:
+        """Make a view of a size in pixels. fovy, fovx: radians. znear, zfar: only shape the clip depth.
+
+        world_view_transform, full_proj_transform: (4,4), transposed.
+        """
         self.image_width = width
         self.image_height = height
         self.FoVy = fovy

@@ -196,23 +196,23 @@ def read_next_bytes(
 
 def read_cameras(path: StrPath, binary: bool) -> dict[int, Camera]:
     """Cameras of a cameras file by their ids."""
-    return _by_ids(_file(path, binary), "camera", _camera)
+    return _collect_by_id(_open_file(path, binary), "camera", _read_camera)
 
 
 def read_images(path: StrPath, binary: bool, with_points: bool = True) -> dict[int, Image]:
     """Photos of an images file by their ids. with_points: and their 2D points, which take time and memory."""
-    return _by_ids(_file(path, binary), "photo", lambda file: _image(file, with_points))
+    return _collect_by_id(_open_file(path, binary), "photo", lambda file: _read_image(file, with_points))
 
 
 def read_points(path: StrPath, binary: bool) -> Points:
     """Points of a points3D file. UserError where two have one id, or where colours of a text range to 1."""
-    file = _file(path, binary)
+    file = _open_file(path, binary)
     points, places = file.points()
     order = np.argsort(points.ids, kind="stable")
     again = np.flatnonzero(np.diff(points.ids[order]) == 0)
     if len(again):
         first, second = (places.of(place) for place in sorted(order[again[0] : again[0] + 2]))
-        raise _twice(file, first, second, f"the id {points.ids[order[again[0]]]}")
+        raise _make_twice_error(file, first, second, f"the id {points.ids[order[again[0]]]}")
     part = (points.rgb % 1).any(axis=1)
     if part.any() and points.rgb.max() <= 1:
         first = part.argmax()
@@ -223,39 +223,40 @@ def read_points(path: StrPath, binary: bool) -> Points:
     return points
 
 
-def _by_ids(file: "_BinaryFile | _TextFile", what: str, parse: Callable[[Any], Record]) -> dict[int, Record]:
+def _collect_by_id(file: "_BinaryFile | _TextFile", what: str, parse: Callable[[Any], Record]) -> dict[int, Record]:
     """The records by their ids. UserError where two have the same id, or photos the same name."""
     found: dict[int, Record] = {}
     places: dict[str, str] = {}
     for record in file.records(what, parse):
         for key in (f"the id {record.id}", *([f"the name {record.name}"] if what == "photo" else ())):
             if key in places:
-                raise _twice(file, places[key], file.place, key)
+                raise _make_twice_error(file, places[key], file.place, key)
             places[key] = file.place
         found[record.id] = record
     return found
 
 
-def _twice(file: "_BinaryFile | _TextFile", first: str, second: str, key: str) -> UserError:
+def _make_twice_error(file: "_BinaryFile | _TextFile", first: str, second: str, key: str) -> UserError:
     return UserError(
         f"{first} and {second} of {file.path} both have {key}; keep one of them, or export the model again"
     )
 
 
-def _camera(file: "_BinaryFile | _TextFile") -> Camera:
+def _read_camera(file: "_BinaryFile | _TextFile") -> Camera:
     (id,), model = file.take("i"), file.model()
     width, height = file.take("QQ")
     return Camera(id, model.model_name, width, height, file.numbers(model.num_params))
 
 
-def _image(file: "_BinaryFile | _TextFile", with_points: bool) -> Image:
+def _read_image(file: "_BinaryFile | _TextFile", with_points: bool) -> Image:
     id, *pose, camera_id = file.take("idddddddi")
     name = file.name()
     xys, ids = file.points_2d(with_points)
     return Image(id, np.array(pose[:4]), np.array(pose[4:]), camera_id, name, xys, ids)
 
 
-def _point(file: "_TextFile") -> tuple[int | float, ...]:
+def _read_point(file: "_TextFile") -> tuple[int | float, ...]:
+    """Read id, position and colour of a 3D point. ValueError for numbers that are not finite or out of range."""
     id, x, y, z, red, green, blue, _ = values = file.take("qddddddd")
     colored = 0 <= red <= 255 and 0 <= green <= 255 and 0 <= blue <= 255
     if not (math.isfinite(x + y + z) and colored) or id >> 63:
@@ -264,7 +265,7 @@ def _point(file: "_TextFile") -> tuple[int | float, ...]:
 
 
 def _table_of_points(rows: Sequence[Sequence[str | int | float]]) -> Points:
-    """The points of rows of id, x, y, z, red, green, blue and error. ValueError where `_point` refuses one."""
+    """The points of rows of id, x, y, z, red, green, blue and error. ValueError where `_read_point` refuses one."""
     table = np.array(rows, dtype=np.float64).reshape(-1, 8)
     ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
     xyz, rgb = table[:, 1:4], table[:, 4:7]
@@ -283,7 +284,7 @@ class _Numbered(NamedTuple):
         return f"{self.what} {self.numbers[index]}"
 
 
-def _file(path: StrPath, binary: bool) -> "_BinaryFile | _TextFile":
+def _open_file(path: StrPath, binary: bool) -> "_BinaryFile | _TextFile":
     return _BinaryFile(path) if binary else _TextFile(path)
 
 
@@ -299,6 +300,7 @@ class _BinaryFile:
         self.place = ""  # of the record that was read last
 
     def records(self, what: str, parse: Callable[["_BinaryFile"], Record]) -> Iterator[Record]:
+        """Read the file's records, each by `parse`. what: their name in messages. UserError for a damaged file."""
         count, number = 1, 1
         try:
             (count,) = self.take("Q")
@@ -335,6 +337,7 @@ class _BinaryFile:
         return text
 
     def points_2d(self, needed: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Read the 2D points of a photo: pixels (N, 2) and ids of their 3D points (N,). needed: else pass over them."""
         (count,), begin = self.take("Q"), self._at
         self._at += count * self._POINT_2D.itemsize
         if self._at > len(self._content):
@@ -370,7 +373,7 @@ class _BinaryFile:
 
 
 @functools.cache
-def _converters(kinds: str) -> list[type]:
+def _choose_converters(kinds: str) -> list[type]:
     return [float if kind == "d" else int for kind in kinds]
 
 
@@ -389,6 +392,7 @@ class _TextFile:
         self._lines: Iterator[tuple[int, str]] = iter(())
 
     def records(self, what: str, parse: Callable[["_TextFile"], Record]) -> Iterator[Record]:
+        """Read the file's records, each by `parse`. what: their name in messages. UserError for a damaged line."""
         with open(self.path, encoding=encoding_of(self.path), errors="surrogateescape") as file:
             self._lines = enumerate(file, start=1)
             try:
@@ -417,14 +421,14 @@ class _TextFile:
         try:
             points = _table_of_points(rows)
         except (ValueError, OverflowError):  # which one it is, they say one by one, which takes three times as long
-            points = _table_of_points(list(self.records("point", _point)))
+            points = _table_of_points(list(self.records("point", _read_point)))
         return points, _Numbered("line", numbers)
 
     def take(self, kinds: str) -> list[int | float]:
         """A value for each letter: a float for d, else an integer."""
         words = self._rest.split(maxsplit=len(kinds))
         self._rest = words.pop() if len(words) > len(kinds) else ""
-        return [convert(word) for convert, word in zip(_converters(kinds), words, strict=True)]
+        return [convert(word) for convert, word in zip(_choose_converters(kinds), words, strict=True)]
 
     def model(self) -> CameraModel:
         word, self._rest = (*self._rest.split(maxsplit=1), "")[:2]
@@ -445,6 +449,7 @@ class _TextFile:
         return self._rest.strip()
 
     def points_2d(self, needed: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Read the 2D points of a photo: pixels (N, 2) and ids of their 3D points (N,). needed: else pass over them."""
         self._number, line = next(self._lines, (self._number, ""))
         words = line.split()
         if not needed and len(words) % 3 == 0:  # a line that was left out would make the next photo one of points

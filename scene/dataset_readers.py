@@ -120,14 +120,14 @@ def readColmapCameras(
     if any(camera.lens for camera in cameras):
         cameras = to_pinholes(cameras)
     if old:
-        return [_published(camera, of_2023=True) for camera in cameras]
+        return [_publish_camera(camera, of_2023=True) for camera in cameras]
     published = []
     for camera in cameras:
         name = os.path.splitext(camera.image_name)[0]
         if depths_folder and (depths_params is None or name in depths_params):
             params = None if depths_params is None else depths_params[name]
             camera = with_map(camera, os.path.join(depths_folder, f"{name}.png"), params, COLMAP_UNIT)
-        published.append(_published(camera, camera.image_name in test_cam_names_list))
+        published.append(_publish_camera(camera, camera.image_name in test_cam_names_list))
     return published
 
 
@@ -150,13 +150,13 @@ def readColmapSceneInfo(
     if isinstance(depths, bool):
         depths, eval, llffhold = "", depths, llffhold if isinstance(eval, bool) else eval
     info = read_colmap(Path(path), images or "images", hold_out=False)
-    views = [_published(view, of_2023=old) for view in info.train_cameras]
+    views = [_publish_camera(view, of_2023=old) for view in info.train_cameras]
     if old:
         views.sort(key=lambda view: view.image_name)
-    tests = _test_views(views, Path(path), llffhold) if eval else set()
+    tests = _choose_test_views(views, Path(path), llffhold) if eval else set()
     views = [replace(view, is_test=index in tests) for index, view in enumerate(views)]
     train = [view for view in views if train_test_exp or not view.is_test]
-    return _published_scene(info, train, [view for view in views if view.is_test], Path(path), depths)
+    return _publish_scene(info, train, [view for view in views if view.is_test], Path(path), depths)
 
 
 def readCamerasFromTransforms(
@@ -180,7 +180,7 @@ def readCamerasFromTransforms(
     for camera in read_frames(Path(path) / transformsfile, suffixes=(extension, *SUFFIXES)):
         if depths_folder:
             camera = with_map(camera, os.path.join(depths_folder, f"{camera.image_name}.png"), None, BLENDER_UNIT)
-        cameras.append(_published(camera, is_test))
+        cameras.append(_publish_camera(camera, is_test))
     return cameras
 
 
@@ -205,7 +205,7 @@ def readNerfSyntheticInfo(
     if not eval:  # the reference marks them in either case
         files = {view.image_path for view in read_frames(Path(path) / "transforms_train.json", suffixes=suffixes)}
         train = [replace(view, is_test=view.image_path not in files) for view in train]
-    return _published_scene(info, train, info.test_cameras, Path(path), depths)
+    return _publish_scene(info, train, info.test_cameras, Path(path), depths)
 
 
 def readNerfstudioInfo(
@@ -213,17 +213,17 @@ def readNerfstudioInfo(
 ) -> SceneInfo:
     """Read a nerfstudio scene, which the reference does not know; arguments as for `readNerfSyntheticInfo`."""
     info = read_nerfstudio(Path(path), "", eval)
-    return _published_scene(info, info.train_cameras, info.test_cameras, Path(path), depths)
+    return _publish_scene(info, info.train_cameras, info.test_cameras, Path(path), depths)
 
 
-def _published(camera: CameraInfo, is_test: bool | None = None, of_2023: bool = False) -> CameraInfo:
+def _publish_camera(camera: CameraInfo, is_test: bool | None = None, of_2023: bool = False) -> CameraInfo:
     """The view with its path as a string, perhaps marked as a test view or not, and perhaps by 2023's shorter name."""
     name = os.path.basename(camera.image_name).split(".")[0] if of_2023 else camera.image_name
     is_test = camera.is_test if is_test is None else is_test
     return replace(camera, image_path=str(camera.image_path), image_name=name, is_test=is_test)
 
 
-def _test_views(views: Sequence[CameraInfo], folder: Path, hold: int) -> set[int]:
+def _choose_test_views(views: Sequence[CameraInfo], folder: Path, hold: int) -> set[int]:
     """Indexes of the views to hold out."""
     if hold:
         tests = set(range(0, len(views), hold))
@@ -242,7 +242,7 @@ def _test_views(views: Sequence[CameraInfo], folder: Path, hold: int) -> set[int
     return tests
 
 
-def _published_scene(
+def _publish_scene(
     info: SceneInfo, train: list[CameraInfo], test: list[CameraInfo], folder: Path, depths: str | None
 ) -> SceneInfo:
     """The scene with these views, depth maps, the size of the training views, and its points as a PLY.
@@ -257,7 +257,7 @@ def _published_scene(
         if not ply.is_file():
             write_point_cloud(ply, points, colors)
     cloud = fetchPly(ply)
-    train, test = ([_published(view) for view in views] for views in (train, test))
+    train, test = ([_publish_camera(view) for view in views] for views in (train, test))
     size = normalization(train, cloud.points)
     info = SceneInfo(cloud, train, test, size, str(ply), info.is_nerf_synthetic)
     return with_depth_maps(info, folder, depths) if depths else info

@@ -50,17 +50,17 @@ class FusedAdam:
 
     def arguments(self, observe: bool) -> "StepArguments":
         """Arguments of the operator for the next step. observe: with the statistics."""
-        optimizer, stepping = self._gaussians.optimizer, list(self._stepping())
+        optimizer, stepping = self._gaussians.optimizer, list(self._list_stepping())
         each = self._penalty.per_value(self._gaussians.gaussian_count)
         *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
         return StepArguments(
             [one.state[name] for name in ("exp_avg", "exp_avg_sq") for one in stepping],
             [one.state["step"] for one in stepping],
-            self._statistics() if observe else (),
+            self._list_statistics() if observe else (),
             guard,
             [one.attribute for one in stepping],
             [one.rate for one in stepping],
-            [*self._constants(), each.opacity, each.scale],
+            [*self._list_constants(), each.opacity, each.scale],
             [one.columns for one in stepping],
             self._sparse,
             iteration,
@@ -78,7 +78,11 @@ class FusedAdam:
         camera: Tensor | None = None,
         awake: Tensor | None = None,
     ) -> None:
-        """Step from the gradients of a view: scene, source, planes as for `gradients_of`, radii (N,) int32 pixels.
+        """Take a step with the gradients of a view.
+
+        source, planes: what the drawing of the view has kept, and the gradients of its images, in the form that
+        `gradients_of` (diff_gaussian_rasterization/ops.py) takes. radii: (N,) int32 pixels. observe, absolute: add the
+        view to the statistics, with sums of absolute gradients. now: see `write_now`, None: no recorded step.
 
         camera: (CAMERA_NUMBERS,) float64 on the Gaussians' device, gets the gradients of the camera's numbers before
         the step. awake: of scene/sleeping.py, None: all are.
@@ -95,30 +99,32 @@ class FusedAdam:
         A step that was recorded with a copy of the numbers on the GPU (`Drawn.step`) then takes the step of
         `iteration`.
         """
-        stepping = list(self._stepping())
+        stepping = list(self._list_stepping())
         attributes, steps = [one.attribute for one in stepping], [one.state["step"] for one in stepping]
         rates = [one.rate for one in stepping]
-        OPERATORS.step_now_(now, attributes, steps, rates, *self._constants(), self._sparse, iteration)
+        OPERATORS.step_now_(now, attributes, steps, rates, *self._list_constants(), self._sparse, iteration)
 
     def places(self) -> tuple[int, ...]:
         """Number of Gaussians, and addresses of all tensors of a step, to detect replaced tensors."""
-        tensors = [t for one in self._stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])]
-        tensors += self._statistics()
+        tensors = [
+            t for one in self._list_stepping() for t in (one.param, one.state["exp_avg"], one.state["exp_avg_sq"])
+        ]
+        tensors += self._list_statistics()
         return len(self._gaussians), *[tensor.data_ptr() for tensor in tensors]
 
     @property
     def _sparse(self) -> bool:
         return isinstance(self._gaussians.optimizer, SparseGaussianAdam)
 
-    def _constants(self) -> tuple[float, float, float]:
+    def _list_constants(self) -> tuple[float, float, float]:
         defaults = self._gaussians.optimizer.defaults
         return (*defaults["betas"], defaults["eps"])
 
-    def _statistics(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _list_statistics(self) -> tuple[Tensor, Tensor, Tensor]:
         statistics = self._gaussians.statistics
         return statistics.max_radii2D, statistics.xyz_gradient_accum, statistics.denom
 
-    def _stepping(self) -> Iterator["_Stepping"]:
+    def _list_stepping(self) -> Iterator["_Stepping"]:
         """The attributes that step, in the operator's order."""
         optimizer, sparse = self._gaussians.optimizer, self._sparse
         groups = {group["name"]: group for group in optimizer.param_groups}

@@ -85,7 +85,7 @@ class GaussianModel(ReferenceNames, GaussianParameters):
     densify_and_clone, densify_and_split = adc.densify_and_clone, adc.densify_and_split
     densification_postfix, prune_points = adc.densification_postfix, adc.prune_points
     reset_opacity = adc.reset_opacity
-    penalise = penalty.penalise
+    add_penalty_gradients = penalty.add_penalty_gradients
 
     # Exposures
 

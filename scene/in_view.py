@@ -16,16 +16,16 @@ def is_in_view(points: Tensor, view: Any, enlargement: float = 1.0) -> Tensor:
     """Tell which points (N, 3) a view shows, (N,) bool. enlargement: of the model where it is drawn."""
     lens = getattr(view, "lens", None)
     if lens and lens.chart != "perspective":
-        x, y, z, _ = _transformed(points, view.world_view_transform)
+        x, y, z, _ = _transform_points(points, view.world_view_transform)
         depth = (x * x + y * y + z * z).sqrt()
         inside = z >= math.cos(min(lens.field(view.image_width, view.image_height), math.pi)) * depth
     else:
-        x, y, _, depth = _transformed(points, view.full_proj_transform)
+        x, y, _, depth = _transform_points(points, view.full_proj_transform)
         inside = (x.abs() < depth) & (y.abs() < depth)
     return inside & (depth > NEAREST / enlargement)
 
 
-def _transformed(points: Tensor, matrix: Tensor) -> list[Tensor]:
+def _transform_points(points: Tensor, matrix: Tensor) -> list[Tensor]:
     """Homogeneous coordinates (N,) behind a transposed matrix (4, 4), each product and sum rounded by itself."""
     x, y, z = points.unbind(1)
     return [x * a + y * b + z * c + d for a, b, c, d in matrix.T.tolist()]

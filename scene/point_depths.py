@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from scene.readers.info import CameraInfo
-from scene.readers.tracks import Track, read_tracks
+from scene.readers.tracks import PhotoPoints, read_tracks
 from scene.scene import Scene
 from scene.view import View
 
@@ -55,25 +55,30 @@ def held_out_points(scene: Scene, source_path: str) -> dict[str, PointDepths]:
 
 
 def points_of(
-    camera: View, view: CameraInfo, track: Track, weight: float = 1.0, held_out: bool = False, enlargement: float = 1.0
+    camera: View,
+    view: CameraInfo,
+    photo: PhotoPoints,
+    weight: float = 1.0,
+    held_out: bool = False,
+    enlargement: float = 1.0,
 ) -> PointDepths | None:
-    """Make the depths of a track's points in a view, with weights of sum `weight`; one point a pixel, the heaviest.
+    """Make the depths of a photo's points in a view, with weights of sum `weight`; one point a pixel, the heaviest.
 
     view: has the dataset's pose and lens, so that a resumed training, where they may have moved, has the same points.
     held_out: those that are never trained on, in place of the others. enlargement: of the model where it is drawn.
     """
-    local = track.points @ view.R + view.T
+    local = photo.points @ view.R + view.T
     if camera.lens is None:
         scale = camera.image_width / view.width, camera.image_height / view.height
-        places = (track.rays * (view.fx, view.fy) + (view.cx, view.cy)) * scale
+        places = (photo.rays * (view.fx, view.fy) + (view.cx, view.cy)) * scale
     else:
-        places = track.places * (camera.image_width, camera.image_height)
+        places = photo.places * (camera.image_width, camera.image_height)
     by_distance = camera.lens is not None and camera.lens.chart != "perspective"
     depths = np.linalg.norm(local, axis=1) if by_distance else local[:, 2]
     columns = range(camera.image_width)[camera.columns or slice(None)]
     x, y = np.floor(places).T
-    trust = (track.lengths - 1) / (1 + track.errors**2)
-    counts = (depths > _NEAR / enlargement) & (trust > 0) & ((track.ranks % HELD_OUT == 0) == held_out)
+    trust = (photo.lengths - 1) / (1 + photo.errors**2)
+    counts = (depths > _NEAR / enlargement) & (trust > 0) & ((photo.ranks % HELD_OUT == 0) == held_out)
     counts &= (x >= columns.start) & (x < columns.stop) & (y >= 0) & (y < camera.image_height)
     if not counts.any():
         return None

@@ -34,7 +34,7 @@ def moved(camera: AnyCamera, twist: Tensor, frame: Frame = "camera") -> AnyCamer
     view, full, center = (values.double() for values in (old, camera.full_proj_transform, camera.camera_center))
     there, back = (motion(by * twist).to(old.device) for by in (1, -1))
     if frame == "camera":
-        from_view = _inverse(view.T)
+        from_view = _invert_affine(view.T)
         there, back = (from_view @ of_view @ view.T for of_view in (there, back))
     twin = copy.copy(camera)
     twin.world_view_transform = (there.T @ view).to(old.dtype)
@@ -43,7 +43,7 @@ def moved(camera: AnyCamera, twist: Tensor, frame: Frame = "camera") -> AnyCamer
     return twin
 
 
-def _inverse(view: Tensor) -> Tensor:
+def _invert_affine(view: Tensor) -> Tensor:
     """Invert an affine map (4, 4) by cross products: a GPU would load a library of solvers for torch's inverse."""
     rows = view[:3, :3]
     dual = torch.linalg.cross(rows.roll(-1, 0), rows.roll(-2, 0))

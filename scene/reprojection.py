@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 
 OUTLIER = 1.0  # pixels; larger errors count linearly (Huber 1964)
 BOUND = 0.05  # of a correction: rotation in radians, and translation in extents of the scene
@@ -15,8 +15,8 @@ _NEAR = 1e-3  # units of depth, or of distance from a fisheye; nearer points do 
 _BEHIND = 3.0  # radians from the axis; beyond, the smallest turn moves a fisheye's points across the image
 
 
-class Pull(NamedTuple):
-    """A sum of Huber losses (pixels squared), and its gradient (6,) by a twist."""
+class PoseLoss(NamedTuple):
+    """The reprojection error of a pose: a sum of Huber losses (pixels squared), and its gradient (6,) by a twist."""
 
     loss: float
     gradient: np.ndarray
@@ -80,25 +80,31 @@ def twist_gradient(pose: np.ndarray, numbers: np.ndarray, unit: float) -> np.nda
     return np.array(turn + move)
 
 
-def pull(pose: np.ndarray, track: Track, focal: float, unit: float) -> Pull:
-    """Reprojection error of a track in a pose, with derivatives by `moved_pose`'s twist at 0.
+def pose_loss(pose: np.ndarray, photo: PhotoPoints, focal: float, unit: float) -> PoseLoss:
+    """Compute the reprojection error of a photo's points in a pose, with derivatives by `moved_pose`'s twist at 0.
 
     pose: world-to-camera matrix (4, 4).
+    photo: 3D points, and their rays in the photo.
     focal: focal length, pixels.
     unit: length of the twist's unit of translation, in world units."""
-    local = np.einsum("ij,kj->ik", pose[:3, :3], track.points) + pose[:3, 3:]
-    rays, rows, seen = (_angular if track.angular else _straight)(local, unit)
+    local = np.einsum("ij,kj->ik", pose[:3, :3], photo.points) + pose[:3, 3:]
+    rays, rows, seen = (_project_fisheye if photo.angular else _project_pinhole)(local, unit)
     shown = focal * seen
-    error = shown * (rays - track.rays.T)
+    error = shown * (rays - photo.rays.T)
     slope, size = shown * rows, np.hypot(*error)
     weight = OUTLIER / np.maximum(size, OUTLIER)
     loss = np.where(size <= OUTLIER, size**2, OUTLIER * (2 * size - OUTLIER)).sum()
     # einsum has one order of sums, whatever the number of threads.
-    return Pull(float(loss), 2 * np.einsum("cjk,ck->j", slope, weight * error), slope, weight, size)
+    return PoseLoss(float(loss), 2 * np.einsum("cjk,ck->j", slope, weight * error), slope, weight, size)
 
 
-def _straight(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rays (2, K), x / z and y / z, of a view's points (3, K), derivatives (2, 6, K) by a twist, and which count."""
+def _project_pinhole(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project points (3, K) of a view's frame to rays of a pinhole, x / z and y / z.
+
+    unit: length of the twist's unit of translation, in world units.
+
+    Returns rays (2, K), their derivatives (2, 6, K) by a twist, and the mask (K,) of points that count.
+    """
     x, y, z = local
     inverse = 1 / np.maximum(z, _NEAR * unit)
     u, v, zero, near = x * inverse, y * inverse, np.zeros_like(x), unit * inverse
@@ -107,8 +113,8 @@ def _straight(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, n
     return np.stack([u, v]), np.array(rows), z > _NEAR * unit
 
 
-def _angular(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The same with rays of angles from the axis, as fisheyes show them (`Track.angular`), up to nearly 180 degrees."""
+def _project_fisheye(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Do as `_project_pinhole` with rays of a fisheye (`PhotoPoints.angular`): angles, up to nearly 180 degrees."""
     x, y, z = local
     aside = np.maximum(np.hypot(x, y), 1e-9 * _NEAR * unit)
     square, angle, zero = aside * aside + z * z, np.arctan2(aside, z), np.zeros_like(x)
@@ -128,22 +134,22 @@ def damped(curvature: np.ndarray) -> np.ndarray:
     return curvature + max(1e-9 * np.trace(curvature), 1e-30) * np.eye(6)
 
 
-def nearest_pose(pose: np.ndarray, track: Track | None, focal: float, unit: float, bound: float) -> np.ndarray:
+def nearest_pose(pose: np.ndarray, photo: PhotoPoints | None, focal: float, unit: float, bound: float) -> np.ndarray:
     """Find the pose of least reprojection error near a pose.
 
-    The pose stays as it is without a track, if noise explains the gain by the F statistic of its six numbers (Seber and
+    The pose stays as it is without points, if noise explains the gain by the F statistic of its six numbers (Seber and
     Lee 2003, section 4.2), or if rotation (radians) or translation (units) exceed `bound`.
     """
-    if track is None:
+    if photo is None:
         return pose
     found = pose
     for _ in range(_STEPS):
-        at = pull(found, track, focal, unit)
+        at = pose_loss(found, photo, focal, unit)
         step = -np.linalg.solve(damped(at.curvature), at.gradient)
         found = moved_pose(found, step, unit)
     change = found @ np.linalg.inv(pose)
     turn = np.arccos(np.clip((np.trace(change[:3, :3]) - 1) / 2, -1, 1))
     apart = np.linalg.norm(change[:3, 3]) / unit
-    before, after = (pull(place, track, focal, unit).loss for place in (pose, found))
-    better = (before - after) * (2 * len(track.points) - 6) > _CHANCE * 6 * after
+    before, after = (pose_loss(place, photo, focal, unit).loss for place in (pose, found))
+    better = (before - after) * (2 * len(photo.points) - 6) > _CHANCE * 6 * after
     return found if better and turn <= bound and apart <= bound else pose

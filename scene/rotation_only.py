@@ -70,7 +70,7 @@ def _read_matches(path: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             (images[one], places_of(database.read_keypoints(one))[rows]) for one, rows in zip(pair, some, strict=True)
         ]
         places.append([pixels - [camera.width / 2, camera.height / 2] for camera, pixels in seen])
-        focals.append([_focal_length(camera) for camera, _ in seen])
+        focals.append([_estimate_focal_length(camera) for camera, _ in seen])
         sides.append(max(seen[0][0].width, seen[0][0].height))
     database.close()
     return np.array(places), np.array(focals), np.array(sides)
@@ -80,6 +80,6 @@ def _is_perspective(camera: pycolmap.Camera) -> bool:
     return len(camera.focal_length_idxs()) > 0 and not camera.is_perspective_fisheye()
 
 
-def _focal_length(camera: pycolmap.Camera) -> float:
+def _estimate_focal_length(camera: pycolmap.Camera) -> float:
     is_known = camera.has_prior_focal_length
     return camera.mean_focal_length() if is_known else _USUAL * max(camera.width, camera.height)

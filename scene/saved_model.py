@@ -47,21 +47,21 @@ def read_model(path: Path, sh_degree: int | None = None) -> GaussianModel:
     """
     if path.suffix == ".pth":
         capture, _ = load_checkpoint(path)
-        degree = _degree(capture[3].shape[1])  # of f_rest
+        degree = _find_degree(capture[3].shape[1])  # of f_rest
         gaussians = GaussianModel(degree if sh_degree is None else sh_degree)
         # UserError for a part that is gone: it may have changed what is drawn.
         registry_of_parts().states_in(extra_state(capture))
         rows = unpack(capture, gaussians._attributes, gaussians.max_sh_degree).rows
     else:
         rows = read_ply(path, sh_degree)
-        gaussians = GaussianModel(_degree(rows["f_rest"].shape[1]))
+        gaussians = GaussianModel(_find_degree(rows["f_rest"].shape[1]))
     warn_of_undrawn(rows, path)
     gaussians.take_whole(rows)
     gaussians.active_sh_degree = gaussians.max_sh_degree
     return gaussians
 
 
-def _degree(coefficients: int) -> int:
+def _find_degree(coefficients: int) -> int:
     """SH degree of so many coefficients above band 0."""
     return round((coefficients + 1) ** 0.5) - 1
 

@@ -71,6 +71,11 @@ class Scene:
         ranks: Ranks = ALONE,
         parts: Sequence[Any] | None = None,
     ) -> None:
+        """Read the dataset of `args` and make its cameras; fill `gaussians` from points or from a saved model.
+
+        load_iteration: iteration to load, -1: the last; None: a new model. start: whether to fill `gaussians`. parts:
+        of the training, None: those that `args` choose. shuffle, resolution_scales: as in the reference.
+        """
         self.model_path = args.model_path
         self.gaussians = gaussians
         self.loaded_iter = load_iteration
@@ -85,10 +90,10 @@ class Scene:
         place = image_device(args.data_device, device, warn=True)
         self.images = ImageStore(getattr(args, "images_to_load", None) or 0, place, device, ranks)
         self.train_cameras, self.test_cameras = (
-            {scale: self._cameras(args, scale, shuffle, views, test) for scale in resolution_scales}
+            {scale: self._make_cameras(args, scale, shuffle, views, test) for scale in resolution_scales}
             for views, test in ((self.info.train_cameras, False), (self.info.test_cameras, True))
         )
-        trained, tested = (self._pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras))
+        trained, tested = (self._list_pictures(chain(*of.values())) for of in (self.train_cameras, self.test_cameras))
         self.images.plan(trained, tested)
 
         gaussians.world_offset = tuple(self.info.offset.tolist())
@@ -115,7 +120,7 @@ class Scene:
         if read := find_reader_replacement(kind):
             info = read_scene_by(read, kind, args)
         else:
-            masks = MaskOptions(**_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
+            masks = MaskOptions(**_list_given(args, folder="masks", invert="invert_masks", meaning="mask_meaning"))
             info = read_scene(
                 args.source_path,
                 args.images,
@@ -125,7 +130,7 @@ class Scene:
                 offset=None if fresh else read_model_json(self.model_path).get(OFFSET, (0, 0, 0)),
                 kind=kind,
                 native=getattr(args, "lenses", "") == "native",
-                **_given(args, init_pcd_path="init_pcd_path", init_type="init_type", rule="holdout"),
+                **_list_given(args, init_pcd_path="init_pcd_path", init_type="init_type", rule="holdout"),
             )
             if fresh:
                 check_masks([(view.image_path, view.mask) for view in info.train_cameras + info.test_cameras], masks)
@@ -144,7 +149,7 @@ class Scene:
 
     def prefetch(self, cameras: Sequence[Camera]) -> None:
         """Start to prepare the images of the views that come next, in that order (`images.ahead` of them)."""
-        self.images.prefetch(self._pictures(cameras))
+        self.images.prefetch(self._list_pictures(cameras))
 
     def save(self, iteration: int, gaussians: SceneGaussians | None = None) -> None:
         """Write `point_cloud/iteration_N/point_cloud.ply`, and what parts write beside it.
@@ -188,7 +193,7 @@ class Scene:
         with atomic_write(folder / "cameras.json") as path:
             path.write_text(json.dumps(entries, allow_nan=False), encoding="utf-8")
 
-    def _cameras(
+    def _make_cameras(
         self, args: argparse.Namespace, scale: float, shuffle: bool, views: Sequence[CameraInfo], test: bool
     ) -> list[Camera]:
         """Cameras of views, which are held out (test) or train, in the same order at every scale."""
@@ -204,7 +209,7 @@ class Scene:
             random.Random(0).shuffle(cameras)
         return cameras
 
-    def _pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
+    def _list_pictures(self, cameras: Iterable[Camera]) -> list[Picture]:
         """Those of our cameras; cameras of other classes have none."""
         return [p for camera in cameras if getattr(camera, "images", None) is self.images for p in camera.undecoded]
 
@@ -214,7 +219,7 @@ def registry_of_parts() -> ModuleType:
     return import_module("splatting.registry")
 
 
-def _given(args: argparse.Namespace, **names: str) -> dict[str, Any]:
+def _list_given(args: argparse.Namespace, **names: str) -> dict[str, Any]:
     """Options that `args` has, by other names; code written for the reference lacks those that we added."""
     values = {name: getattr(args, option, None) for name, option in names.items()}
     return {name: value for name, value in values.items() if value is not None}

@@ -40,6 +40,7 @@ class Sleeping:
     """The sleeping blocks of a model, and the steps that they have missed."""
 
     def __init__(self, gaussians: GaussianModel) -> None:
+        """Start with all blocks of a model awake."""
         self._gaussians, self._adam = gaussians, FusedAdam(gaussians)
         self._terms = gaussians._xyz.detach().new_zeros(_TERMS)
         self.awake = self._terms.new_empty(0, dtype=torch.uint8)
@@ -60,7 +61,10 @@ class Sleeping:
         self._is_whole = True
 
     def wake(self, scene: Scene, now: Tensor | None = None) -> Tensor:
-        """Wake the blocks that the scene's camera may show, before a step. now: from FusedAdam.write_now.
+        """Wake the blocks that the scene's camera may show, before a step.
+
+        now: the step's numbers (NOW_WORDS,) int64 that `FusedAdam.write_now` has written, copied to the GPU, where a
+        CUDA graph reads them; None: they are taken from the optimiser.
 
         Returns the blocks that are awake for the rasterizer: on a GPU their list, so that only these cost time; on a
         CPU, and with several ranks, a flag for each block.
@@ -90,7 +94,7 @@ class Sleeping:
         if self._asleep is not None:
             self._put_back(self._asleep)
             self._asleep = None
-        self._wake(self._anywhere(), True)
+        self._wake(self._make_any_view(), True)
         self._is_whole = True
 
     def rows(self) -> Tensor:
@@ -104,8 +108,8 @@ class Sleeping:
             yield
             return
         states = {"awake": self.awake, "taken": self._taken, "terms": self._terms}
-        self._asleep = {name: values.clone() for name, values in states.items()} | {"rows": self._copied()}
-        self._wake(self._anywhere(), True)
+        self._asleep = {name: values.clone() for name, values in states.items()} | {"rows": self._copy_sleeping_rows()}
+        self._wake(self._make_any_view(), True)
         try:
             yield
         finally:
@@ -144,37 +148,42 @@ class Sleeping:
             ) from error
 
     def _put_back(self, state: State) -> None:
+        """Restore the blocks, then the values and averages of the rows that sleep in them, from a state."""
         self.awake.copy_(state["awake"])
         self._taken.copy_(state["taken"])
         self._terms.copy_(state["terms"])
-        rows = self._sleepers()
-        for values, kept in zip(self._moved(), state["rows"], strict=True):
+        rows = self._list_sleeping_rows()
+        for values, kept in zip(self._list_changed_tensors(), state["rows"], strict=True):
             for part, piece in zip(rows.split(PIECE), kept.split(PIECE), strict=True):  # the GPU may have little room
                 values.index_copy_(0, part, piece.to(values.device))
         self._is_whole = False
 
-    def _copied(self) -> list[Tensor]:
-        """Copy the values and averages of the sleeping rows; to the host if the device has no memory left."""
-        rows, moved = self._sleepers(), self._moved()
+    def _copy_sleeping_rows(self) -> list[Tensor]:
+        """Copy what `flushed_view` changes of the sleeping rows (K), so that `_put_back` can restore it to the bit.
+
+        Returns a tensor (K, ...) for each one of `_list_changed_tensors`, in that order; on the host if the device
+        has no memory left.
+        """
+        rows, moved = self._list_sleeping_rows(), self._list_changed_tensors()
         if not (self._gaussians.storage and any(map(is_spilled, moved))):
             with suppress(torch.OutOfMemoryError):
                 return [values[rows] for values in moved]
         return [to_host(values, rows) for values in moved]
 
-    def _sleepers(self) -> Tensor:
+    def _list_sleeping_rows(self) -> Tensor:
         return (~self.rows()).nonzero().reshape(-1)
 
-    def _values(self) -> list[Tensor]:
+    def _list_values(self) -> list[Tensor]:
         return [self._gaussians.raw(name).detach() for name in _NAMES]
 
-    def _moved(self) -> list[Tensor]:
-        """All tensors that a step changes."""
+    def _list_changed_tensors(self) -> list[Tensor]:
+        """List the tensors (N, ...) that a step changes: six attributes, then exp_avg and exp_avg_sq of each."""
         states = [self._gaussians.optimizer.state_of(self._gaussians.raw(name)) for name in _NAMES]
-        return [*self._values(), *(state[name] for state in states for name in ("exp_avg", "exp_avg_sq"))]
+        return [*self._list_values(), *(state[name] for state in states for name in ("exp_avg", "exp_avg_sq"))]
 
-    def _anywhere(self) -> Scene:
-        """The rasterizer's arguments to wake all blocks: the Gaussians with an arbitrary camera, which is not read."""
-        means, opacities, scales, rotations, sh_dc, sh_rest = self._values()
+    def _make_any_view(self) -> Scene:
+        """Make the rasterizer's arguments to wake all blocks: the Gaussians, and any camera, which is not read."""
+        means, opacities, scales, rotations, sh_dc, sh_rest = self._list_values()
         matrix, center = torch.eye(4, device=means.device), means.new_zeros(3)
         shapes = means, opacities, scales, rotations, None, None
         return Scene(*shapes, sh_dc, sh_rest, matrix, matrix, center, (1.0, 1.0, 1.0), (16, 16, 0, False, True))

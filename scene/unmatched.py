@@ -58,13 +58,16 @@ def collect_shown(image: pycolmap.Image, order: dict[int, int], points: np.ndarr
     numbers = np.array([number for number, _ in seen], np.int64)
     places = np.array([xy for _, xy in seen], float).reshape(-1, 2)
     world = points[numbers]
-    cells, nearest = _cells(image.camera, places), np.full(_CELLS**2, np.inf)
+    cells, nearest = _find_cells(image.camera, places), np.full(_CELLS**2, np.inf)
     np.minimum.at(nearest, cells, np.linalg.norm(world - image.projection_center(), axis=1))
     return Shown(image, numbers, world, places, np.bincount(cells, minlength=_CELLS**2), nearest)
 
 
 def find_overlaps(model: pycolmap.Reconstruction, path: str) -> Iterator[Overlap]:
-    """Compare photos of a model whose features a database has compared, also without success."""
+    """Yield an Overlap for each pair of posed photos whose features COLMAP has compared, also where none matched.
+
+    path: of COLMAP's database, which lists the compared pairs and their matches.
+    """
     database = pycolmap.Database.open(path)
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     order = {number: row for row, number in enumerate(model.points3D)}
@@ -107,13 +110,13 @@ def count_expected(one: Shown, other: Shown, matched: np.ndarray) -> tuple[int, 
     is_shared[:] = False
     is_shared[one.numbers] = True
     got = np.bincount(
-        _cells(camera, np.concatenate([matched, other.places[is_shared[other.numbers]]])), minlength=_CELLS**2
+        _find_cells(camera, np.concatenate([matched, other.places[is_shared[other.numbers]]])), minlength=_CELLS**2
     )
     points, away = points[is_like], away[1][is_like]
     places = np.asarray(camera.img_from_cam(other.image.cam_from_world() * points), float).reshape(-1, 2)
     with np.errstate(invalid="ignore"):
         inside = ((places >= 0) & (places < [camera.width, camera.height])).all(1)
-    cells = _cells(camera, places[inside])
+    cells = _find_cells(camera, places[inside])
     is_visible = (away[inside] < _NEARER * other.nearest[cells]) & (other.count[cells] >= _FEWEST)
     should = np.bincount(cells[is_visible], minlength=_CELLS**2) >= _FEWEST
     return int((should | (got > 0)).sum()), int((should & (got == 0)).sum())
@@ -129,7 +132,7 @@ def find_cover(pairs: Sequence[tuple[str, str]]) -> list[str]:
     return found
 
 
-def _cells(camera: pycolmap.Camera, places: np.ndarray) -> np.ndarray:
+def _find_cells(camera: pycolmap.Camera, places: np.ndarray) -> np.ndarray:
     column, row = np.clip((places / [camera.width, camera.height] * _CELLS).astype(int), 0, _CELLS - 1).T
     return row * _CELLS + column
 

@@ -65,20 +65,20 @@ class View:
         self.device = compute_device()
         self._photo_device = image_device(data_device, self.device)
         self._images: ImageStore | None = None
-        self._source, self._mask = self._placed(info.image) or self.image_path, info.mask
+        self._source, self._mask = self._put_on_device(info.image) or self.image_path, info.mask
         if self._mask and self._mask.meaning == TRANSPARENT:
             self._source, self._mask = Cutout(self.image_path, info.mask), None
         elif info.opaque:
             self._source = Opaque(self.image_path)
         self._ignore_alpha = info.ignore_alpha
         self.depth_has_gaps = getattr(info.depth, "metric", False)
-        self._depth = self._placed(info.depth)
+        self._depth = self._put_on_device(info.depth)
         self._reliable = self._depth is not None and depth_fit(info.depth_params).reliable
         self.pictures: dict[str, Source | InMemory] = {}
         self._projection = projection(ZNEAR, ZFAR, self.FoVx, self.FoVy, *offset).numpy()
         self.place(info.R, info.T)
 
-    def _placed(self, source: Source | InMemory | None) -> Source | InMemory | None:
+    def _put_on_device(self, source: Source | InMemory | None) -> Source | InMemory | None:
         return InMemory(source.pixels.to(self._photo_device)) if isinstance(source, InMemory) else source
 
     def place(self, R: np.ndarray, T: np.ndarray) -> None:
@@ -90,10 +90,11 @@ class View:
 
     @cached_property
     def numbers(self) -> np.ndarray:
-        """Elements (51,) float32 of world_view_transform, full_proj_transform, camera_center and projection_matrix.
+        """The camera as the rasterizer's kernels take it, (51,) float32 on the host.
 
-        The elements follow from the pose of `place`, whatever was assigned, on the host. They are computed in float64,
-        so that they are rounded only once.
+        In this order: world_view_transform (16), full_proj_transform (16), camera_center (3), projection_matrix (16).
+
+        They follow from the pose of `place`, whatever was assigned, and are rounded from float64 only once.
         """
         view, project = world_to_camera(*self._pose), self._projection
         center = camera_center(self._pose[0], view[:3, 3])
@@ -136,16 +137,18 @@ class View:
             start, stop, _ = self.columns.indices(old)
             twin.columns = slice(-(-start * size[0] // old), stop * size[0] // old)
         twin._photo_device = self.device
-        twin._source = self._changed(self._source, lambda photo: shrink_photo(photo, size, self._ignore_alpha))
-        twin._mask = self._changed(self._mask, lambda mask: shrink_mask(mask, size))
-        twin._depth = self._changed(self._depth, lambda depth: shrink_values(depth, size))
+        twin._source = self._change_pixels(self._source, lambda photo: shrink_photo(photo, size, self._ignore_alpha))
+        twin._mask = self._change_pixels(self._mask, lambda mask: shrink_mask(mask, size))
+        twin._depth = self._change_pixels(self._depth, lambda depth: shrink_values(depth, size))
         twin.pictures = {
-            name: self._changed(source, lambda values: shrink_photo(values, size, ignore_alpha=True))
+            name: self._change_pixels(source, lambda values: shrink_photo(values, size, ignore_alpha=True))
             for name, source in self.pictures.items()
         }
         return twin
 
-    def _changed(self, source: Source | InMemory | None, change: Callable[[Tensor], Tensor]) -> InMemory | None:
+    def _change_pixels(self, source: Source | InMemory | None, change: Callable[[Tensor], Tensor]) -> InMemory | None:
+        """Apply `change` to the pixels of a picture, on `device`: now, or later for an image that processes share."""
+
         def on_device(pixels: Tensor) -> Tensor:
             return change(pixels.to(self.device, non_blocking=True))
 
@@ -173,21 +176,21 @@ class View:
         sources = (self._source, self._mask, self._depth, *self.pictures.values())
         return [(s, self._size) for s in sources if s is not None and not has_pixels(s)]
 
-    def _stored(self, source: Source | InMemory) -> Tensor:
+    def _load_pixels(self, source: Source | InMemory) -> Tensor:
         return source.pixels if has_pixels(source) else self.images.get(source, self._size)
 
-    def _decoded(self, source: Source | InMemory) -> Tensor:
-        return self._stored(source).to(self.device, non_blocking=True)
+    def _load_on_device(self, source: Source | InMemory) -> Tensor:
+        return self._load_pixels(source).to(self.device, non_blocking=True)
 
     def picture(self, name: str) -> Tensor | None:
         """The further picture of a name, (C,H,W) uint8 on `device`; None for a view without one."""
         source = self.pictures.get(name)
-        return None if source is None else self._decoded(source)
+        return None if source is None else self._load_on_device(source)
 
     def ground_truth(self, background: Tensor) -> tuple[Tensor, Tensor | None]:
         """`target` and `counted_pixels`, with one copy of the image to the device for both."""
-        pixels = self._decoded(self._source)
-        return self._target(pixels, background), self._counting(pixels)
+        pixels = self._load_on_device(self._source)
+        return self._target(pixels, background), self._valid_pixels(pixels)
 
     def target(self, background: Tensor) -> Tensor:
         """Image (3,H,W) that a render of this view over `background` (3,) in [0,1] should equal.
@@ -195,9 +198,10 @@ class View:
         uint8, meaning value / 255, for a photo without alpha, or whose alpha is a mask; else float32, composited over
         the background.
         """
-        return self._target(self._decoded(self._source), background)
+        return self._target(self._load_on_device(self._source), background)
 
     def _target(self, pixels: Tensor, background: Tensor) -> Tensor:
+        """Compute `target` (3,H,W) from the photo's pixels (3 or 4,H,W) on `device`."""
         if pixels.shape[0] == 3 or self._ignore_alpha:
             return pixels[:3] if pixels.dtype == torch.uint8 else pixels[:3].float()
         if pixels.dtype == torch.uint8:
@@ -213,10 +217,14 @@ class View:
     @property
     def counted_pixels(self) -> Tensor | None:
         """Pixels that count in loss and scores, (1,H,W) bool; None if all count."""
-        return self._counting(self._decoded(self._source) if self._ignore_alpha else None)
+        return self._valid_pixels(self._load_on_device(self._source) if self._ignore_alpha else None)
 
-    def _counting(self, pixels: Tensor | None) -> Tensor | None:
-        counts = None if self._mask is None else self._decoded(self._mask) == 255
+    def _valid_pixels(self, pixels: Tensor | None) -> Tensor | None:
+        """Compute `counted_pixels` (1,H,W) bool from the mask and from the photo's pixels.
+
+        pixels (3 or 4,H,W): uint8 on `device`, 255 is opaque; None where alpha is no mask, as they are not read then.
+        """
+        counts = None if self._mask is None else self._load_on_device(self._mask) == 255
         if self._ignore_alpha and pixels.shape[0] == 4:
             opaque = pixels[3:] == 255
             counts = opaque if counts is None else counts & opaque
@@ -230,5 +238,5 @@ class View:
     @property
     def target_inverse_depth(self) -> Tensor | None:
         """Inverse depth (1,H,W) float32 on `device`, 1 / world units, 0 where unknown; None without a map."""
-        depth = None if self._depth is None else self._decoded(self._depth)
+        depth = None if self._depth is None else self._load_on_device(self._depth)
         return depth.nan_to_num(0.0) if self.depth_has_gaps else depth

@@ -46,7 +46,7 @@ def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
     if planes and at.steps:
         _step_camera(run, at, planes)  # a view's pose and lens, where they are trained
     if any(strategy.penalty):
-        gaussians.penalise(strategy.penalty)  # a part of the loss that no render shows
+        gaussians.add_penalty_gradients(strategy.penalty)  # a part of the loss that no render shows
     tell.measured(at, losses)  # progress, scores and saves of the model as it was rendered
     strategy.after_backward(at, package)  # statistics; clone, split, prune, reset opacities
     if at.steps:  # as in the reference, the last iteration takes no step

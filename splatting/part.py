@@ -74,7 +74,7 @@ from groundwork.finding import Finding
 from scene.cameras import Camera
 from scene.gaussians.density_rules import Actions, Window
 from scene.readers.info import CameraInfo, SceneInfo
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 from scene.scene import Scene
 from splatting.iteration import Iteration, Losses, Term
 from splatting.schedule import Schedule
@@ -146,7 +146,7 @@ class Part:
         return False
 
     @staticmethod
-    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterable[Finding]:
+    def advise(scene: Scene, tracks: Sequence[PhotoPoints | None]) -> Iterable[Finding]:
         """Return findings on a scene, with the options of train.py that the findings speak for."""
         return ()
 

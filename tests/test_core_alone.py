@@ -91,7 +91,7 @@ def _imports(path: Path) -> tuple[set[str], set[Path]]:
 
 def test_a_test_is_left_out_with_each_application_that_it_imports(request):
     """conftest.py looks at a test and its helpers. That the core imports no application, tests/test_house.py checks."""
-    rooms_of = request.config.pluginmanager.get_plugin(str(ROOT / "conftest.py"))._rooms
+    rooms_of = request.config.pluginmanager.get_plugin(str(ROOT / "conftest.py"))._list_rooms
     for test in (*ROOT.glob("tests/**/test_*.py"), *ROOT.glob("applications/*/tests/test_*.py")):
         files, rooms = [test], set()
         for file in files:

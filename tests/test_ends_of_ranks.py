@@ -39,7 +39,7 @@ def in_torchrun(monkeypatch):
 def test_the_environment_of_torchrun_is_whole_or_none(in_torchrun):
     assert (torchrun.rank(), torchrun.size(), torchrun.local_rank(), torchrun.local_size()) == (3, 4, 1, 2)
     in_torchrun.setattr(os, "sched_getaffinity", lambda pid: set(range(8)), raising=False)
-    in_torchrun.setattr(machine, "_quota", lambda: float("inf"))
+    in_torchrun.setattr(machine, "_read_quota", lambda: float("inf"))
     assert machine.cores() == 4
     in_torchrun.delenv("LOCAL_RANK")  # as on a cluster that sets some of these names itself
     assert (torchrun.rank(), torchrun.size(), torchrun.local_size()) == (0, 1, 1)

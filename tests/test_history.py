@@ -266,7 +266,7 @@ def test_the_names_of_temporary_files_are_known(tmp_path, monkeypatch, name):
     with atomic_write(tmp_path / name) as temporary:
         temporary.touch()
         assert not remove_temporary_files(tmp_path)  # this process lives
-        monkeypatch.setattr("groundwork.files.folders._runs", lambda process: process != os.getpid())
+        monkeypatch.setattr("groundwork.files.folders._is_running", lambda process: process != os.getpid())
         assert remove_temporary_files(tmp_path) == [temporary]
         temporary.touch()
 

@@ -57,7 +57,7 @@ def judges(tmp_path_factory) -> Judges:
 def _cache_of_torch(judges, monkeypatch) -> None:
     monkeypatch.setenv("TORCH_HOME", str(judges.home))
     monkeypatch.setattr(lpips_utils, "_network_failed", False)
-    monkeypatch.setattr(lpips_utils, "_url", judges.urls.__getitem__)
+    monkeypatch.setattr(lpips_utils, "_find_url", judges.urls.__getitem__)
     lpipsPyTorch._network.cache_clear()
 
 
@@ -177,11 +177,13 @@ def test_weights_of_a_folder_are_checked(judges, tmp_path, monkeypatch):
     metrics.make_metrics("alex", tmp_path, 40)
     shutil.copyfile(judges.files["alex"], tmp_path / judges.files["vgg"].name)
     refused("both", f"{name} is damaged: its SHA-256 begins with")
-    monkeypatch.setattr(lpips_utils, "_url", lambda net: judges.urls["alex"])  # the right digest, but another network
+    monkeypatch.setattr(
+        lpips_utils, "_find_url", lambda net: judges.urls["alex"]
+    )  # the right digest, but another network
     refused("vgg", "the file does not have the weights of vgg16; replace it by https://somewhere/alexnet")
     for wrong in ([1, 2], {}, {"features.0.weight": 1}):
         torch.save(wrong, tmp_path / "wrong-.pth")
-        monkeypatch.setattr(lpips_utils, "_url", lambda net: "https://somewhere/wrong-.pth")
+        monkeypatch.setattr(lpips_utils, "_find_url", lambda net: "https://somewhere/wrong-.pth")
         refused("vgg", "does not have the weights")
 
 

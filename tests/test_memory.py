@@ -66,7 +66,7 @@ def test_a_disk_without_space_is_told_before_the_training(colmap_scene, tmp_path
 
 
 def test_free_memory_is_what_the_kernel_and_the_container_leave(tmp_path, monkeypatch):
-    available = memory._available()
+    available = memory._read_available()
     if available is None:
         pytest.skip("this system has no /proc/meminfo")
     monkeypatch.setattr(memory, "_CGROUP", tmp_path)

@@ -22,7 +22,7 @@ from utils.system_utils import UserError
 MAY = {
     "the one place that looks for programs": "groundwork.host.programs.find_program",
     "runs what find_program found, such as npm and what that installs by a record of the repository": """
-        groundwork.host.machine._output applications.doctor.environment._find_nvidia_gpu
+        groundwork.host.machine._run_program applications.doctor.environment._find_nvidia_gpu
         applications.convert.colmap._read_output applications.export.sog.find_fault
         applications.export.vendor._run_command applications.convert.programs._run_command
         gaussian_renderer.camera_paths.video.write_video""",

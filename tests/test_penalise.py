@@ -42,7 +42,7 @@ def test_a_models_penalty_is_of_its_means(given, replaced):
     wanted = torch.autograd.grad(0.3 * params[0].sigmoid().mean() + 0.7 * params[1].exp().mean(), params)
     for param in params:
         param.grad = torch.ones_like(param) if given else None
-    gaussians.penalise(Penalty(0.3, 0.7))
+    gaussians.add_penalty_gradients(Penalty(0.3, 0.7))
     for param, gradient in zip(params, wanted, strict=True):
         torch.testing.assert_close(param.grad, gradient + given)
     assert not any(NO_PENALTY)

@@ -117,7 +117,7 @@ def test_the_report_takes_the_renders_arguments_of_the_2024_release(camera, more
 
 
 def test_screen_points_are_zeros_with_a_gradient_of_their_own_in_every_render(camera):
-    gaussian_renderer._zero.cache_clear()
+    gaussian_renderer._make_zero.cache_clear()
     gaussians = model(20)
     with torch.inference_mode():  # rendering an image first must not prevent training
         package = render(camera, gaussians, pipeline(), BLACK)

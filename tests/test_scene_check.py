@@ -19,7 +19,7 @@ from synthetic import BROWN, HEIGHT, WIDTH, edit_json, make_blender_scene, make_
 from applications.convert.images import find_masks, find_shared_pixels
 from applications.convert.shared_masks import write_shared_masks
 from groundwork.finding import Finding, Severity
-from scene.checks.photo_files import _same_photos, check_blur
+from scene.checks.photo_files import _find_same_photos, check_blur
 from scene.checks.photos import SHARED_TEXT, check_photos
 from scene.checks.scene import check_dataset, findings, report
 from scene.gaussians.copies import clusters_of
@@ -481,6 +481,6 @@ def test_photos_that_differ_between_what_is_compared_first_are_two(sound, tmp_pa
         path = tmp_path / f"{number}.bmp"
         path.write_bytes(content)
         views.append(replace(view, image_path=path))
-    assert [*_same_photos(views)] == [[0], [1]]
+    assert [*_find_same_photos(views)] == [[0], [1]]
     views[1].image_path.write_bytes(views[0].image_path.read_bytes())
-    assert [*_same_photos(views)] == [[0, 1]]
+    assert [*_find_same_photos(views)] == [[0, 1]]

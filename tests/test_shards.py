@@ -60,7 +60,7 @@ def _train(gaussians: GaussianModel, density: object, iterations: tuple[int, ...
             param = gaussians.raw(name)
             param.grad = _random(gaussians, f"{name}{iteration}", *param.shape[1:])
         if any(density.penalty):
-            gaussians.penalise(density.penalty)
+            gaussians.add_penalty_gradients(density.penalty)
         points = torch.zeros(len(gaussians), 3)
         points.grad = THRESHOLD * (2 * _random(gaussians, f"seen{iteration}", 3)).round()  # several are the same
         radii = (20 * _random(gaussians, f"radii{iteration}").abs()).int()

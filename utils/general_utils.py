@@ -66,6 +66,7 @@ def get_expon_lr_func(
     """
 
     def rate(step: int) -> float:
+        """Return the learning rate of a step, counted from 0."""
         if step < 0:
             return 0.0
         delay = 1.0

@@ -46,7 +46,7 @@ def ssim(img1: Tensor, img2: Tensor, window_size: int = WINDOW, size_average: bo
     img1, img2 = (image[None] if image.dim() == 3 else image for image in (img1, img2))
     if window_size != WINDOW or not _kernels_fit(img1, img2):
         blur = separable_blur(gaussian_taps(window_size, SIGMA), img1)
-        return _mean(similarity(img1, img2, blur, C1, C2), size_average)
+        return _take_mean(similarity(img1, img2, blur, C1, C2), size_average)
     if img2.requires_grad:
         img1, img2 = img2, img1  # SSIM is symmetric, and the kernels differentiate it by their first image
     if size_average:
@@ -64,7 +64,7 @@ def _kernels_fit(img1: Tensor, img2: Tensor) -> bool:
     return alike and img1.dtype in dtypes and img1.numel() > 0 and has_backend(img1.device.type)
 
 
-def _mean(similarities: Tensor, size_average: bool) -> Tensor:
+def _take_mean(similarities: Tensor, size_average: bool) -> Tensor:
     return similarities.mean() if size_average else similarities.mean(dim=(1, 2, 3))
 
 
@@ -92,7 +92,7 @@ def _ssim(
     def blur(image: Tensor) -> Tensor:
         return F.conv2d(image, window, padding=window_size // 2, groups=channel)
 
-    return _mean(similarity(img1, img2, blur, C1, C2), size_average)
+    return _take_mean(similarity(img1, img2, blur, C1, C2), size_average)
 
 
 def photometric_loss(

@@ -72,6 +72,7 @@ def _import_with_torchvision(name: str) -> ModuleType:
 
 
 def _declare_missing_operators() -> None:
+    """Declare torchvision's operators that its compiled part would declare, so that it imports without that."""
     global _schemas  # the schemas live as long as this object
     _schemas = library.Library("torchvision", "FRAGMENT")
     for name in ("nms", "qnms"):
@@ -85,7 +86,7 @@ def load_network(net: str, folder: Path | None, device: torch.device) -> nn.Modu
     folder: the folder of torchvision's file of the backbone, under its own name; None: torch's cache, then a download.
     Raises LpipsUnavailable without weights, and UserError for a missing or wrong file.
     """
-    state = _features_from_cache(net) if folder is None else _load_state(weights_file(net, folder))
+    state = _load_from_cache(net) if folder is None else _load_state(weights_file(net, folder))
     lpips = import_lpips()
     with _without_weights(net):
         model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
@@ -98,8 +99,8 @@ def load_dists(folder: Path, device: torch.device) -> nn.Module:
 
     Raises LpipsUnavailable without the package or torchvision's VGG-16 in the folder, and UserError for wrong files.
     """
-    if not (file := folder / Path(_url("vgg")).name).is_file():
-        raise LpipsUnavailable(_lacking(file, "vgg"))
+    if not (file := folder / Path(_find_url("vgg")).name).is_file():
+        raise LpipsUnavailable(_describe_lacking(file, "vgg"))
     try:
         package = importlib.import_module("DISTS_pytorch")
     except ImportError as error:
@@ -107,7 +108,7 @@ def load_dists(folder: Path, device: torch.device) -> nn.Module:
     with _without_weights("vgg"):
         model = package.DISTS(load_weights=False)
     _fill(model, _load_state(weights_file("vgg", folder)), "vgg")
-    file = _checked(Path(package.__file__).with_name("weights.pt"), _OF_DISTS, "install DISTS-pytorch again")
+    file = _check_file(Path(package.__file__).with_name("weights.pt"), _OF_DISTS, "install DISTS-pytorch again")
     model.load_state_dict(_load_state(file), strict=False)
     return model.to(device).eval().requires_grad_(False)
 
@@ -134,7 +135,7 @@ def load_stlpips(device: torch.device) -> nn.Module:
     package = import_stlpips()
     model = package.LPIPS(pretrained=False, net="alex", variant="shift_tolerant", verbose=False)
     file = Path(package.__file__).with_name("weights") / "vST0.0" / "alex_shift_tolerant.pth"
-    state = _load_state(_checked(file, _OF_STLPIPS, "install stlpips-pytorch again"))
+    state = _load_state(_check_file(file, _OF_STLPIPS, "install stlpips-pytorch again"))
     model.load_state_dict(state, strict=False)  # which names the last layers once, and the model twice
     return model.to(device).eval().requires_grad_(False)
 
@@ -156,10 +157,10 @@ def _fill(model: nn.Module, state: dict[str, torch.Tensor], net: str) -> None:
         found = {name: state[f"features.{name.split('.', 1)[1]}"] for name in own}
         model.load_state_dict(found, strict=False, assign=True)
     except (LookupError, TypeError, RuntimeError) as error:
-        raise UserError(f"the file does not have the weights of {NETS[net]}; replace it by {_url(net)}") from error
+        raise UserError(f"the file does not have the weights of {NETS[net]}; replace it by {_find_url(net)}") from error
 
 
-def _checked(file: Path, digest: str, remedy: str) -> Path:
+def _check_file(file: Path, digest: str, remedy: str) -> Path:
     """Return the file if its SHA-256 begins with `digest`; else, or if it is missing, UserError."""
     try:
         found = hashlib.sha256(plain_path(file).read_bytes()).hexdigest()
@@ -172,24 +173,24 @@ def _checked(file: Path, digest: str, remedy: str) -> Path:
 
 def weights_file(net: str, folder: Path) -> Path:
     """Find torchvision's file of a backbone in a folder; UserError if it is missing, damaged or another one."""
-    file = folder / Path(_url(net)).name
+    file = folder / Path(_find_url(net)).name
     if not file.exists():
-        raise UserError(_lacking(file, net))
-    return _checked(file, _digest_of(file), f"replace it by {_url(net)}")
+        raise UserError(_describe_lacking(file, net))
+    return _check_file(file, _find_digest(file), f"replace it by {_find_url(net)}")
 
 
-def _lacking(file: Path, net: str) -> str:
+def _describe_lacking(file: Path, net: str) -> str:
     return (
         f"{file.parent} has no file {file.name}, the weights of {NETS[net]}; give the folder that has it as --weights, "
-        f"or download {_url(net)} into this one"
+        f"or download {_find_url(net)} into this one"
     )
 
 
-def _url(net: str) -> str:
+def _find_url(net: str) -> str:
     return f"{_SITE}/{_FILES[net]}"
 
 
-def _digest_of(file: Path) -> str:
+def _find_digest(file: Path) -> str:
     """The first digits of the SHA-256, from the end of the name of a torchvision file."""
     return file.stem.rpartition("-")[2]
 
@@ -201,8 +202,9 @@ def _load_state(file: Path) -> dict[str, torch.Tensor]:
         raise UserError(f"{file} is not a state dict of torchvision: {error}; download it again") from error
 
 
-def _features_from_cache(net: str) -> dict[str, torch.Tensor]:
-    url = _url(net)
+def _load_from_cache(net: str) -> dict[str, torch.Tensor]:
+    """Load the weights of torchvision's network `net` from torch's cache; download them if they are missing."""
+    url = _find_url(net)
     cached = Path(torch.hub.get_dir()) / "checkpoints" / url.rsplit("/", 1)[1]
     if not cached.is_file() and not _download(url, cached):
         forbidden, weights = os.environ.get("GS_DOWNLOAD"), f"the weights of {NETS[net]}"
@@ -228,7 +230,7 @@ def _download(url: str, file: Path) -> bool:
     socket.setdefaulttimeout(_DOWNLOAD_TIMEOUT)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        torch.hub.download_url_to_file(url, str(file), hash_prefix=_digest_of(file))
+        torch.hub.download_url_to_file(url, str(file), hash_prefix=_find_digest(file))
     except (OSError, RuntimeError, http.client.HTTPException):  # no network, refused, or a damaged download
         _network_failed = True
     finally:

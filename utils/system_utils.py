@@ -43,13 +43,13 @@ def run_cli(main: Callable[[], object], several: bool = False) -> None:
     """
     start.after_imports()
     try:
-        status = _status(main) if torchrun.size() == 1 else _status_of_several(main, several)
+        status = _run_alone(main) if torchrun.size() == 1 else _run_among_several(main, several)
         sys.stdout.flush()  # now, while a broken pipe can still be caught
     except BrokenPipeError:
         _discard_output()
         status = 141
     except OSError as error:
-        if error.filename is not None or not _output_fails():
+        if error.filename is not None or not _is_output_broken():
             raise
         with contextlib.suppress(OSError):
             reason = f"cannot write to the standard output ({error.strerror})"
@@ -62,7 +62,8 @@ def run_cli(main: Callable[[], object], several: bool = False) -> None:
         sys.exit(status)
 
 
-def _output_fails() -> bool:
+def _is_output_broken() -> bool:
+    """Tell whether the standard output cannot be written, as on a full disk, by writing a line end to it."""
     try:
         sys.stdout.flush()
         os.write(sys.__stdout__.fileno(), b"\n")
@@ -78,24 +79,25 @@ def _discard_output() -> None:
         os.dup2(nowhere, stream.fileno())
 
 
-def _status(main: Callable[[], object]) -> int:
-    status, line = _outcome(main)
+def _run_alone(main: Callable[[], object]) -> int:
+    status, line = _run_command(main)
     if line:
         print(line, file=sys.stderr)
     return status
 
 
-def _status_of_several(main: Callable[[], object], several: bool) -> int:
+def _run_among_several(main: Callable[[], object], several: bool) -> int:
+    """Run a command in one of torchrun's processes, and return its exit status. several: it may."""
     if not several:
         if torchrun.rank() == 0:
             print(f"error: {Path(sys.argv[0]).name} runs in one process; start it without torchrun", file=sys.stderr)
         return 2
     from groundwork.ranks.launcher import run_together  # it loads torch.distributed
 
-    return run_together(main, _outcome)
+    return run_together(main, _run_command)
 
 
-def _outcome(main: Callable[[], object]) -> tuple[int, str]:
+def _run_command(main: Callable[[], object]) -> tuple[int, str]:
     """Run a command. Returns its exit status, and the message for stderr."""
     try:
         main()

@@ -24,7 +24,7 @@ from groundwork.ranks.ranks import ranks
 from scene.checks.scene import findings, report
 from scene.gaussian_model import GaussianModel
 from scene.readers.info import CameraInfo
-from scene.readers.tracks import Track, read_tracks
+from scene.readers.tracks import PhotoPoints, read_tracks
 from scene.scene import Scene
 from splatting.registry import PARTS, check_together, chosen
 from utils.system_utils import UserError, mkdir_p
@@ -129,14 +129,14 @@ def _read_trained_options(model: str) -> list[str]:
         return []
 
 
-def _check_distances(scene: Scene, tracks: list[Track | None]) -> Iterator[Finding]:
+def _check_distances(scene: Scene, tracks: list[PhotoPoints | None]) -> Iterator[Finding]:
     """Advise by the tracks of structure from motion: options that pay where photos have unlike distances."""
     ratio = measure_distance_ratio(scene.info.train_cameras, tracks)
     text = f"the farthest photo of a point is {ratio:.1f} times as far away as the nearest (median)"
     yield note(text, "--antialiasing" if ratio > DISTANCES else "")
 
 
-def measure_distance_ratio(views: list[CameraInfo], tracks: list[Track | None]) -> float:
+def measure_distance_ratio(views: list[CameraInfo], tracks: list[PhotoPoints | None]) -> float:
     """Return the largest over the smallest distance of a point from the photos that see it, the median over points.
 
     Distances are in focal lengths.

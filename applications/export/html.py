@@ -82,8 +82,8 @@ def write_html(
     cameras: the training views; those that the notes name become bookmarks, or else up to 10 of them.
     make_path: makes the animation from the poses of the cameras; None: the viewer's own animation, around the model, or
     swaying where the page's first camera is in the model's box.
-    background: RGB in [0, 1]. title: None: that of the notes, or the file's name. notes: texts on views. start: index of the page's first camera.
-    picture: address of an image that is shown beside a link to the page; empty: none.
+    background: RGB in [0, 1]. title: None: that of the notes, or the file's name. notes: texts on views.
+    start: index of the page's first camera. picture: address of an image beside a link to the page; empty: none.
     upright: true if up is UP already; else the direction is found by the cameras.
     metric: true if a unit is a metre; else a headset shows the model as if photos were taken from two metres.
     solid: what visitors of the page stop at, in the viewer's axes; None: visitors cannot walk.

@@ -62,9 +62,9 @@ class Page:
         untrained: bool = False,
         oriented: str | None = None,
     ) -> None:
-        """Start to listen. UserError if that cannot be done.
+        """Start to listen. UserError if that fails. port: 0 for any that is free. white: background, else black.
 
-        port: 0 for any that is free. white: the background at first, else black. kept: (N,) bool, what cleaning leaves.
+        kept: (N,) bool, what cleaning leaves.
         untrained: the Gaussians are a scene's points, and the page shows where its cameras stand.
         oriented: the scene's folder, "" without one, if the page may set right how it stands; None: it may not.
         """

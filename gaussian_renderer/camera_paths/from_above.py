@@ -49,8 +49,8 @@ def render_top(
         raise UserError(
             f"{scene.model_path} has no Gaussians below its highest camera; --path {TOP} has nothing to show"
         )
-    low, high = _box(places[below][:, [0, 2]].double().cpu().numpy(), (poses.positions @ axes.T)[:, [0, 2]])
-    (width, height), unit_a_pixel = _size(high - low, size)
+    low, high = _find_box(places[below][:, [0, 2]].double().cpu().numpy(), (poses.positions @ axes.T)[:, [0, 2]])
+    (width, height), unit_a_pixel = _fit_size(high - low, size)
     away = _AWAY * unit_a_pixel * max(width, height)
     middle = (low + high) / 2
     ground = float(places[below][:, 1].median())
@@ -87,7 +87,7 @@ def upright_axes(poses: Poses, known: Similarity | None) -> np.ndarray:
     return np.stack([np.cross(down, unit(level)), down, unit(level)])
 
 
-def _box(places: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _find_box(places: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Opposite corners (2,) of the box to show, of places (N,2) around cameras (M,2)."""
     most = np.quantile(places, [_OUTLIERS, 1 - _OUTLIERS], axis=0)
     spread = _AROUND * float(np.linalg.norm(cameras - cameras.mean(0), axis=1).max())
@@ -98,7 +98,7 @@ def _box(places: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return low - _RIM * (high - low), high + _RIM * (high - low)
 
 
-def _size(shown: np.ndarray, size: tuple[int, int] | None) -> tuple[tuple[int, int], float]:
+def _fit_size(shown: np.ndarray, size: tuple[int, int] | None) -> tuple[tuple[int, int], float]:
     """Width and height in pixels, and world units a pixel, that show a width and a height of the world (2,)."""
     if size is None:
         size = tuple(max(2, round(_LONGEST * float(side / shown.max()))) for side in shown)

@@ -36,6 +36,10 @@ class Interpolated:
     closed = False
 
     def __init__(self, poses: Poses, seconds: float = SECONDS) -> None:
+        """Order the poses (N) along a way and fit a smooth curve to it, passed at a constant speed in `seconds`.
+
+        UserError for fewer than two different poses.
+        """
         self.seconds = seconds
         ordered = poses[visiting_order(poses)]
         self.keys = keys = without_repeats(ordered[spread_along(ordered, max(2, round(KEYS_A_SECOND * seconds)))])
@@ -46,27 +50,27 @@ class Interpolated:
             )
         rows = np.column_stack([keys.positions, _align_signs(keys.quaternions), keys.fov])
         self._radius = turning_radius(keys)
-        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(self._steps(rows)))])
+        knots = np.concatenate([[0.0], np.cumsum(np.sqrt(self._measure_steps(rows)))])
         # Tangents of the parabola through a row and its neighbours; at the ends, of the line.
         self._curve = CubicHermiteSpline(knots, rows, np.gradient(rows, knots, axis=0))
         samples = np.unique(np.linspace(knots[:-1], knots[1:], _SEGMENT_SAMPLES + 1))
-        way = np.concatenate([[0.0], np.cumsum(self._steps(self._rows(samples)))])
+        way = np.concatenate([[0.0], np.cumsum(self._measure_steps(self._evaluate_rows(samples)))])
         grows = np.concatenate([[True], np.diff(way) > _STEP * way[-1]])
         # Monotone and smooth, so that speed is constant and does not jump at the samples.
         self._knot_at = PchipInterpolator(way[grows] / way[grows][-1], samples[grows])
 
     def at(self, seconds: float) -> Keyframe:
         """The pose at a moment between 0 and `seconds`."""
-        row = self._rows(self._knot_at(np.array([seconds / self.seconds])))[0].tolist()
+        row = self._evaluate_rows(self._knot_at(np.array([seconds / self.seconds])))[0].tolist()
         return Keyframe(seconds, tuple(row[:3]), tuple(row[3:7]), row[7])
 
-    def _rows(self, knots: np.ndarray) -> np.ndarray:
+    def _evaluate_rows(self, knots: np.ndarray) -> np.ndarray:
         rows = self._curve(knots)
         rows[:, 3:7] /= np.linalg.norm(rows[:, 3:7], axis=1, keepdims=True)
         rows[:, 7] = rows[:, 7].clip(self.keys.fov.min(), self.keys.fov.max())
         return rows
 
-    def _steps(self, rows: np.ndarray) -> np.ndarray:
+    def _measure_steps(self, rows: np.ndarray) -> np.ndarray:
         """`distances` of neighbours, by chords: arccos has no digits left for small turns."""
         change = np.diff(rows, axis=0)
         half = np.linalg.norm(change[:, 3:7], axis=1) / 2
@@ -85,6 +89,7 @@ class Ellipse:
     closed = True
 
     def __init__(self, poses: Poses, seconds: float = SECONDS) -> None:
+        """Fit the ellipse around the point that the cameras of `poses` look at. UserError where they look at none."""
         self.seconds = seconds
         _refuse_one_place(poses, "ellipse")
         focus = focus_point(poses)
@@ -117,6 +122,7 @@ class Spiral:
     closed = True
 
     def __init__(self, poses: Poses, seconds: float = SECONDS) -> None:
+        """Fit the spiral to `poses` that face one way. UserError for poses that do not."""
         self.seconds = seconds
         _refuse_one_place(poses, "spiral")
         mean = poses.forward.mean(axis=0)
@@ -166,8 +172,8 @@ def visiting_order(poses: Poses) -> np.ndarray:
     kept = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MOST)).round().astype(int))
     table = distances(poses[kept])
     given = np.arange(len(kept))
-    tour = _two_opt(_nearest_first(table), table)
-    return kept[tour if _length(tour, table) < _length(given, table) / 2 else given]
+    tour = _improve_order(_order_by_nearest(table), table)
+    return kept[tour if _sum_lengths(tour, table) < _sum_lengths(given, table) / 2 else given]
 
 
 def spread_along(poses: Poses, count: int) -> np.ndarray:
@@ -187,11 +193,12 @@ def distances(poses: Poses) -> np.ndarray:
     return moved + radius * 2 * np.arccos(np.minimum(np.abs(quaternions @ quaternions.T), 1.0))
 
 
-def _length(order: np.ndarray, table: np.ndarray) -> float:
+def _sum_lengths(order: np.ndarray, table: np.ndarray) -> float:
     return float(table[order[:-1], order[1:]].sum())
 
 
-def _nearest_first(table: np.ndarray) -> np.ndarray:
+def _order_by_nearest(table: np.ndarray) -> np.ndarray:
+    """Order rows from 0 on, each time to the nearest one left: (N,) int. table: distances (N, N)."""
     order, left = [0], np.ones(len(table), bool)
     left[0] = False
     while left.any():
@@ -200,11 +207,11 @@ def _nearest_first(table: np.ndarray) -> np.ndarray:
     return np.array(order)
 
 
-def _two_opt(order: np.ndarray, table: np.ndarray) -> np.ndarray:
+def _improve_order(order: np.ndarray, table: np.ndarray) -> np.ndarray:
     """Reverse parts of an open tour as long as that shortens the tour (2-opt); the first pose stays first."""
     order = order.copy()
     for _ in range(_PASSES):
-        before = _length(order, table)
+        before = _sum_lengths(order, table)
         for start in range(1, len(order) - 1):
             ends = np.arange(start + 1, len(order))
             after = np.append(order[ends[:-1] + 1], -1)  # the last end has no successor
@@ -213,7 +220,7 @@ def _two_opt(order: np.ndarray, table: np.ndarray) -> np.ndarray:
             if gain.max() > 1e-9:
                 end = ends[gain.argmax()]
                 order[start : end + 1] = order[start : end + 1][::-1]
-        if _length(order, table) >= before - 1e-9:
+        if _sum_lengths(order, table) >= before - 1e-9:
             break
     return order
 
@@ -257,10 +264,10 @@ def ring(poses: Poses, focus: np.ndarray, normal: np.ndarray) -> Callable[[float
     middle, half = covered_arc(np.arctan2(places[:, 1], places[:, 0]))
     if half < math.pi:
         radius = np.full(2, np.median(np.linalg.norm(places, axis=1)))
-        return lambda share: _on(radius, middle + half * math.sin(2 * math.pi * share), plane) + height * normal
+        return lambda share: _find_point(radius, middle + half * math.sin(2 * math.pi * share), plane) + height * normal
     radius = np.percentile(np.abs(places), 90, axis=0)
-    angle_at = _even_angles(radius)
-    return lambda share: _on(radius, float(angle_at(share)), plane) + height * normal
+    angle_at = _make_even_angles(radius)
+    return lambda share: _find_point(radius, float(angle_at(share)), plane) + height * normal
 
 
 def covered_arc(angles: np.ndarray) -> tuple[float, float]:
@@ -274,11 +281,11 @@ def covered_arc(angles: np.ndarray) -> tuple[float, float]:
     return float(angles[widest] - half), max(float(half), _LEAST_SWAY)
 
 
-def _on(radius: np.ndarray, angle: float, plane: np.ndarray) -> np.ndarray:
+def _find_point(radius: np.ndarray, angle: float, plane: np.ndarray) -> np.ndarray:
     return plane @ (radius * np.array([math.cos(angle), math.sin(angle)]))
 
 
-def _even_angles(radius: np.ndarray) -> PchipInterpolator:
+def _make_even_angles(radius: np.ndarray) -> PchipInterpolator:
     """Interpolate the angle on an ellipse with half axes (2,) from a share of its length."""
     angles = np.linspace(0, 2 * math.pi, _SAMPLES + 1)
     steps = np.diff(np.column_stack([radius[0] * np.cos(angles), radius[1] * np.sin(angles)]), axis=0)
@@ -287,6 +294,7 @@ def _even_angles(radius: np.ndarray) -> PchipInterpolator:
 
 
 def _refuse_one_place(poses: Poses, name: str) -> None:
+    """Raise a UserError if all cameras are in one place. name: of the path, for the message."""
     if not poses.spread:
         raise UserError(
             f"--path {name} needs training cameras in at least two places, and all of them are in one; take --path "

@@ -80,6 +80,7 @@ class KeyframePath:
     closed = False
 
     def __init__(self, path: CameraPath) -> None:
+        """Prepare the interpolation between the keyframes of a path: of positions, fields of view and rotations."""
         from scipy.spatial.transform import Rotation, Slerp  # takes a while to import
 
         self.seconds = path.seconds
@@ -105,10 +106,10 @@ class KeyframePath:
 
 def read_camera_path(path: Path) -> CameraPath:
     """Read a file of `CameraPath.write`, or one written by hand. UserError, naming the keyframe, for a wrong one."""
-    content = _content(path)
+    content = _read_content(path)
     if not isinstance(content, dict) or not isinstance(content.get("keyframes"), list):
         raise UserError(f"{path} is no camera path: it needs a list called keyframes")
-    keyframes = tuple(_keyframe(entry, f"{path}: keyframe {n}") for n, entry in enumerate(content["keyframes"], 1))
+    keyframes = tuple(_read_keyframe(entry, f"{path}: keyframe {n}") for n, entry in enumerate(content["keyframes"], 1))
     if len(keyframes) < 2:
         raise UserError(f"{path} has {len(keyframes)} keyframes; a camera path needs at least 2")
     for n, (one, next_) in enumerate(zip(keyframes, keyframes[1:], strict=False), 2):
@@ -122,7 +123,8 @@ def read_camera_path(path: Path) -> CameraPath:
     return CameraPath(keyframes, easing)
 
 
-def _content(path: Path) -> Any:
+def _read_content(path: Path) -> Any:
+    """Read the JSON content of a path's file. UserError for a file that cannot be read."""
     try:
         return read_json(path)
     except OSError as error:
@@ -134,11 +136,12 @@ def _content(path: Path) -> Any:
         raise UserError(f"the camera path {path} is not JSON ({reason}); save it again from the viewer") from error
 
 
-def _keyframe(entry: Any, where: str) -> Keyframe:
+def _read_keyframe(entry: Any, where: str) -> Keyframe:
+    """Read one keyframe from its JSON object, and check its values. where: its place, for messages."""
     if not isinstance(entry, dict):
         raise UserError(f"{where} must be an object with seconds, position, wxyz and fov")
-    seconds, fov = _numbers(entry, "seconds", None, where)[0], _numbers(entry, "fov", None, where)[0]
-    position, wxyz = _numbers(entry, "position", 3, where), _numbers(entry, "wxyz", 4, where)
+    seconds, fov = _read_numbers(entry, "seconds", None, where)[0], _read_numbers(entry, "fov", None, where)[0]
+    position, wxyz = _read_numbers(entry, "position", 3, where), _read_numbers(entry, "wxyz", 4, where)
     length = math.hypot(*wxyz)
     if not _FOV[0] <= fov <= _FOV[1]:
         raise UserError(f"{where}: fov must be {_FOV[0]} to {_FOV[1]} degrees, got {fov}")
@@ -149,7 +152,7 @@ def _keyframe(entry: Any, where: str) -> Keyframe:
     return Keyframe(seconds, position, tuple(value / length for value in wxyz), fov)
 
 
-def _numbers(entry: dict, name: str, count: int | None, where: str) -> tuple[float, ...]:
+def _read_numbers(entry: dict, name: str, count: int | None, where: str) -> tuple[float, ...]:
     """Return the finite numbers of an entry: a list of `count`, or with None a single number."""
     value = entry.get(name)
     values = value if count else [value]

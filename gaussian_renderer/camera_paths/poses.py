@@ -54,10 +54,10 @@ class Poses:
     @property
     def quaternions(self) -> np.ndarray:
         """The turns as unit quaternions (N,4) wxyz."""
-        return _rotations(self.turns).as_quat(scalar_first=True)
+        return _make_rotations(self.turns).as_quat(scalar_first=True)
 
 
-def _rotations(turns: np.ndarray) -> "Rotation":
+def _make_rotations(turns: np.ndarray) -> "Rotation":
     from scipy.spatial.transform import Rotation  # takes a while to import
 
     return Rotation.from_matrix(turns)
@@ -72,7 +72,7 @@ def spread_of(positions: np.ndarray) -> float:
 def poses_of(cameras: Sequence[Camera]) -> Poses:
     """The poses of views, by their matrices."""
     views = _matrices(cameras)
-    turns = _rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
+    turns = _make_rotations(views[:, :3, :3].transpose(0, 2, 1)).as_matrix()
     return Poses(_positions(views), turns, np.degrees([vertical_fov(camera) for camera in cameras]))
 
 
@@ -128,7 +128,7 @@ def look_along(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
 
 def keyframe(seconds: float, position: np.ndarray, turn: np.ndarray, fov: float) -> Keyframe:
     """Make a Keyframe of a pose with a turn (3,3)."""
-    wxyz = _rotations(turn).as_quat(scalar_first=True)
+    wxyz = _make_rotations(turn).as_quat(scalar_first=True)
     return Keyframe(seconds, tuple(position.tolist()), tuple(wxyz.tolist()), float(fov))
 
 

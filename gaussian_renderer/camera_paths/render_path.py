@@ -89,17 +89,18 @@ def path_request(args: argparse.Namespace) -> PathRequest | None:
         for name in _OF_VIDEOS:
             if getattr(args, name) not in (None, False):
                 raise UserError(f"--path {TOP} is one picture, without --{name}; leave it out")
-        return PathRequest(TOP, None, size=args.size and _checked_size(*args.size))
+        return PathRequest(TOP, None, size=args.size and _check_size(*args.size))
     fps = FPS if args.fps is None else args.fps
     if not 1 <= fps <= MOST_FPS:
         raise UserError(f"--fps must be 1 to {MOST_FPS}, got {fps}")
-    size = args.size and _checked_size(*args.size)
+    size = args.size and _check_size(*args.size)
     make = path_maker(args.path, args.seconds, [TOP])
     find_ffmpeg()
     return PathRequest(Path(args.path).stem, make, fps, size, args.frames)
 
 
-def _checked_size(width: int, height: int) -> tuple[int, int]:
+def _check_size(width: int, height: int) -> tuple[int, int]:
+    """Return a video's width and height, pixels, if both are even and in range; else raise a UserError."""
     if not (2 <= width <= LARGEST_SIDE and 2 <= height <= LARGEST_SIDE):
         raise UserError(f"--size must be two even numbers of 2 to {LARGEST_SIDE} pixels, got {width} {height}")
     if width % 2 or height % 2:
@@ -145,9 +146,10 @@ def render_path(
 ) -> Path:
     """Write the video of a path, and its frames if they are asked for; return the video's path.
 
-    scene: with a loaded model. pipe, background: as for `render`. Files: MODEL/videos/ours_N/NAME.mp4 and
-    MODEL/videos/ours_N/NAME/00000.png ...; frames of an earlier run are removed. UserError if the path cannot be made
-    of the scene's cameras, or if something cannot be written.
+    scene: with a loaded model. pipe: the pipeline options. background: (3,) in [0, 1].
+
+    Files: MODEL/videos/ours_N/NAME.mp4 and MODEL/videos/ours_N/NAME/00000.png ...; frames of an earlier run are
+    removed. UserError if the path cannot be made of the scene's cameras, or if something cannot be written.
     """
     from gaussian_renderer.camera_paths.poses import poses_of  # SciPy takes a while to import
 

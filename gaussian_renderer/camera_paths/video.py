@@ -47,7 +47,7 @@ def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: in
     """
     program = find_ffmpeg()
     with atomic_write(path) as temporary, tempfile.TemporaryFile() as said:
-        command = [program, *_arguments(width, height, fps), f"file:{temporary}"]
+        command = [program, *_list_arguments(width, height, fps), f"file:{temporary}"]
         # In a session of its own Ctrl-C does not reach it; it is ended below.
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": said}
         try:
@@ -60,19 +60,19 @@ def write_video(path: Path, frames: Iterable[np.ndarray], width: int, height: in
         count = 0
         try:
             for frame in frames:
-                if not _accepted(process.stdin.write, np.ascontiguousarray(frame).data):
-                    raise _failure(process, said, path, count)
+                if not _try_to_write(process.stdin.write, np.ascontiguousarray(frame).data):
+                    raise _explain_failure(process, said, path, count)
                 count += 1
-            if not _accepted(process.stdin.close) or process.wait():
-                raise _failure(process, said, path, count)
+            if not _try_to_write(process.stdin.close) or process.wait():
+                raise _explain_failure(process, said, path, count)
         finally:
             if process.poll() is None:
                 process.kill()
                 process.wait()
-            _accepted(process.stdin.close)
+            _try_to_write(process.stdin.close)
 
 
-def _accepted(act: Callable[..., object], *values: object) -> bool:
+def _try_to_write(act: Callable[..., object], *values: object) -> bool:
     """Call `act`, which writes to ffmpeg; False if ffmpeg has ended."""
     try:
         act(*values)
@@ -81,7 +81,8 @@ def _accepted(act: Callable[..., object], *values: object) -> bool:
     return True
 
 
-def _failure(process: subprocess.Popen, said: IO[bytes], path: Path, count: int) -> UserError:
+def _explain_failure(process: subprocess.Popen, said: IO[bytes], path: Path, count: int) -> UserError:
+    """Return the error to raise after ffmpeg has failed. said: its messages. count: frames that it was given."""
     with contextlib.suppress(subprocess.TimeoutExpired):
         process.wait(_WAIT)
     said.seek(0)
@@ -94,7 +95,8 @@ def _failure(process: subprocess.Popen, said: IO[bytes], path: Path, count: int)
     )
 
 
-def _arguments(width: int, height: int, fps: int) -> list[str]:
+def _list_arguments(width: int, height: int, fps: int) -> list[str]:
+    """List ffmpeg's arguments, without its name and the output, to encode raw RGB frames from its input as H.264."""
     # Exact rounding, and values of colour that lie where H.264 has them: on the left one of two pixels.
     exact = "flags=bicubic+accurate_rnd+full_chroma_int+full_chroma_inp:out_h_chr_pos=0:out_v_chr_pos=128"
     colours = f"scale=in_range=full:out_range=limited:out_color_matrix=bt709:{exact},format=yuv420p"

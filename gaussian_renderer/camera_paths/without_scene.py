@@ -83,8 +83,10 @@ def circle_cameras(means: np.ndarray) -> list[Camera]:
     for number, angle in enumerate(2 * np.pi * np.arange(COUNT) / COUNT):
         away = np.array([np.sin(angle), -_HIGH, -np.cos(angle)])
         turn = look_along(-away, np.array([0.0, -1.0, 0.0]))
-        infos.append(_info(number, f"around {number}", turn, middle + (radius or 1.0) * away, *SIZE, _FOCAL * SIZE[0]))
-    return _cameras(infos)
+        infos.append(
+            _make_info(number, f"around {number}", turn, middle + (radius or 1.0) * away, *SIZE, _FOCAL * SIZE[0])
+        )
+    return _make_cameras(infos)
 
 
 def recorded_cameras(path: Path, resolution: int = 1) -> list[Camera]:
@@ -93,7 +95,7 @@ def recorded_cameras(path: Path, resolution: int = 1) -> list[Camera]:
     UserError if there is none, or it is damaged.
     """
     try:
-        return _cameras([_recorded(number, entry) for number, entry in enumerate(read_json(path))], resolution)
+        return _make_cameras([_read_entry(number, entry) for number, entry in enumerate(read_json(path))], resolution)
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path} has no cameras that can be read ({error}); give the scene with -s") from error
 
@@ -127,19 +129,19 @@ def have_moved(folder: Path, cameras: Sequence[Camera]) -> bool:
     return bool(np.median(apart) > _MOVED * spread_of(then) > 0)
 
 
-def _recorded(number: int, entry: Mapping[str, Any]) -> CameraInfo:
+def _read_entry(number: int, entry: Mapping[str, Any]) -> CameraInfo:
     turn, place = (np.array(entry[name], np.float64) for name in ("rotation", "position"))
     numbers = (int(entry["width"]), int(entry["height"]), float(entry["fx"]), float(entry["fy"]))
-    return _info(number, str(entry["img_name"]), turn, place, *numbers)
+    return _make_info(number, str(entry["img_name"]), turn, place, *numbers)
 
 
-def _info(
+def _make_info(
     number: int, name: str, turn: np.ndarray, place: np.ndarray, width: int, height: int, fx: float, fy: float = 0.0
 ) -> CameraInfo:
     options = {"image_name": name, "image_path": name, "width": width, "height": height}
     return CameraInfo(number, turn, -turn.T @ place, fx=fx, fy=fy or fx, **options)
 
 
-def _cameras(infos: Sequence[CameraInfo], resolution: int = 1) -> list[Camera]:
+def _make_cameras(infos: Sequence[CameraInfo], resolution: int = 1) -> list[Camera]:
     sizes = (training_size(info.width, info.height, resolution) for info in infos)
     return [Camera(info, size, number) for number, (info, size) in enumerate(zip(infos, sizes, strict=True))]

@@ -55,8 +55,8 @@ class Bands:
         """The rows of pixels that other ranks' losses read of this band, and this rank's loss of theirs."""
         own, wide = self.pixels(self._rank), self.pixels(self._rank, REACH)
         others = [rank for rank in range(len(self.borders) - 1) if rank != self._rank]
-        given = {rank: _common(own, self.pixels(rank, REACH)) for rank in others}
-        taken = {rank: _common(self.pixels(rank), wide) for rank in others}
+        given = {rank: _intersect(own, self.pixels(rank, REACH)) for rank in others}
+        taken = {rank: _intersect(self.pixels(rank), wide) for rank in others}
         return tuple(Rows(parts | {self._rank: range(0)}, self._device) for parts in (given, taken))
 
 
@@ -69,7 +69,7 @@ class Rows:
         self.indices = self.indices.to(device)
 
 
-def _common(one: tuple[int, int], other: tuple[int, int]) -> range:
+def _intersect(one: tuple[int, int], other: tuple[int, int]) -> range:
     """Intersect two ranges of rows."""
     return range(max(one[0], other[0]), min(one[1], other[1]))
 
@@ -158,7 +158,10 @@ class CachedBands:
         return kept.bands
 
     def note_processed(self, view: Hashable, last: Tensor) -> None:
-        """Note the work of the last visit before bands are found again. last: as for `processed_by_row`."""
+        """Note the work of the last visit before bands are found again.
+
+        last: (H, W), the position behind the last instance of a pixel in its tile's list.
+        """
         kept = self._kept[(view, *last.shape)]
         if kept.count == _VISITS:
             kept.processed = processed_by_row(last, kept.bands.own)

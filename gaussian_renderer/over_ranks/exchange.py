@@ -79,7 +79,7 @@ def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Ten
         part[-1] = part.sum().remainder(2)
     own = ranks.send(kept, sent.received, sent.sizes)[0]
     more = [part[-1:] for part in own.split(sent.sizes)]
-    numbers = read_later(torch.cat((_sums(own, sent.sizes), _sums(kept, sent.received), *more)))
+    numbers = read_later(torch.cat((_sum_parts(own, sent.sizes), _sum_parts(kept, sent.received), *more)))
     summed = OPERATORS.sum_runs(rows, counts, kept, len(rows) + ranks.size)  # before the host waits
     found = numbers()
     padded, to_send, rest = (found[part * ranks.size : (part + 1) * ranks.size] for part in range(3))
@@ -87,6 +87,6 @@ def _send_back(ranks: Ranks, sent: Sent, rows: Tensor, counts: Tensor, kept: Ten
     return arrived, own, sum(padded) - sum(rest)
 
 
-def _sums(counts: Tensor, sizes: Sequence[int]) -> Tensor:
+def _sum_parts(counts: Tensor, sizes: Sequence[int]) -> Tensor:
     """Sum consecutive parts of counts, of `sizes` each: (parts,) int64."""
     return torch.stack([part.sum() for part in counts.split(sizes)])

@@ -51,6 +51,7 @@ class _OverRanks(torch.autograd.Function):
     def forward(
         ctx: Any, ranks: Ranks, options: tuple, numbers: Tensor | None, _: Tensor, *gaussians: Any
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """Draw the view of all processes' Gaussians, and keep what `backward` needs if the model is trained."""
         camera, background, want_depth, train, absolute = options
         view = gather_image(draw_view(ranks, Scene(*gaussians, *camera), background, want_depth, train))
         ctx.mark_non_differentiable(view.radii)
@@ -67,6 +68,7 @@ class _OverRanks(torch.autograd.Function):
     @staticmethod
     @first_order("rasterize")
     def backward(ctx: Any, grad_color: Tensor | None, grad_depth: Tensor | None, _: None) -> tuple:
+        """Return the gradients of `forward`'s arguments, of this process's Gaussians, from those of image and depth."""
         scene, view = Scene(*ctx.saved_tensors, *ctx.camera), ctx.view
         if grad_color is None:
             grad_color = torch.zeros_like(view.color)

@@ -33,14 +33,14 @@ def gradient_of_colors(scene: Scene, source: Sequence[Tensor], planes: Sequence[
     return gradients_of(given, source, planes, _ONLY_COLORS)[_ONLY_COLORS.index(True)]
 
 
-def _ranks_of(model: Any) -> Ranks:
+def _find_ranks(model: Any) -> Ranks:
     """The ranks among which a model's Gaussians are divided; `ALONE` for a whole model, of any class."""
     return getattr(getattr(model, "shards", None), "ranks", ALONE)
 
 
 def rasterizer_of(model: Any) -> Callable[..., Rasterized]:
     """Return `rasterize`, or `rasterize_over` bound to the ranks among which a model is divided."""
-    return partial(rasterize_over, ranks) if (ranks := _ranks_of(model)).several else rasterize
+    return partial(rasterize_over, ranks) if (ranks := _find_ranks(model)).several else rasterize
 
 
 def draw_divided(
@@ -54,7 +54,7 @@ def draw_divided(
     awake: Tensor | None = None,
 ) -> "DividedDrawn | None":
     """Do as `draw` of the renderer for a model that is divided among ranks; None for a whole model."""
-    if not (ranks := _ranks_of(model)).several:
+    if not (ranks := _find_ranks(model)).several:
         return None
     find = bands and partial(bands.find, camera.uid)
     view = draw_view(ranks, scene, background, want_depth, train=True, find=find, awake=awake)
@@ -73,6 +73,11 @@ class DividedDrawn:
     def __init__(
         self, view: View, scene: Scene, want_depth: bool, by_bands: bool, awake: Tensor | None, blocks: Sequence[int]
     ) -> None:
+        """Keep a drawn view of a divided model, and what its gradients need.
+
+        by_bands: this process has the loss of its own band of the image only. awake: blocks of Gaussians that take
+        part.
+        """
         self.image, self.depth, self.radii = view.color, view.inverse_depth if want_depth else None, view.radii
         self.band = view.band if by_bands else None
         self._view, self._scene, self._awake, self._blocks = view, scene, awake, blocks
@@ -81,10 +86,10 @@ class DividedDrawn:
         return decisive_in(self._view)
 
     def color_gradient(self, image_gradient: Tensor) -> Tensor:
-        return gradient_of_colors(self._scene, self._source((image_gradient, None, None), absolute=False), ())
+        return gradient_of_colors(self._scene, self._make_source((image_gradient, None, None), absolute=False), ())
 
     def camera_gradient(self, image_gradient: Tensor, depth_gradient: Tensor | None) -> Tensor:
-        source = self._source((image_gradient, None, depth_gradient), absolute=False)
+        source = self._make_source((image_gradient, None, depth_gradient), absolute=False)
         return camera_gradient(self._view.ranks, self._scene, source, blocks=self._blocks)
 
     def step(
@@ -97,13 +102,18 @@ class DividedDrawn:
         now: None = None,
         camera: Tensor | None = None,
     ) -> None:
+        """Take Adam's step with the gradients of an image (3, H, W) and of inverse depth (1, H, W).
+
+        observe: add the view to the statistics of density control; absolute: with sums of absolute gradients. camera:
+        receives the gradient by the camera's numbers.
+        """
         absolute &= observe
-        source = self._source((image_gradient, None, depth_gradient), absolute)
+        source = self._make_source((image_gradient, None, depth_gradient), absolute)
         if camera is not None:
             found = camera_gradient(self._view.ranks, self._scene, source, absolute, self._blocks)
             camera[: len(found)] = found
         adam.apply(self._scene, source, (), self.radii, observe, absolute, now, awake=self._awake)
 
-    def _source(self, planes: tuple[Tensor | None, ...], absolute: bool) -> tuple[Tensor, ...]:
+    def _make_source(self, planes: tuple[Tensor | None, ...], absolute: bool) -> tuple[Tensor, ...]:
         view = self._view
         return view.splats, view.tile_counts, *gradient_rows(view, planes, absolute)

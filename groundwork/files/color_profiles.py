@@ -27,12 +27,12 @@ class _Change(NamedTuple):
 
 def has_other_colors(image: Image.Image) -> bool:
     """Tell by a photo's header whether its profile means other colours than sRGB; a message says so once."""
-    return _change_of(image).transform is not None
+    return _find_change(image).transform is not None
 
 
 def to_srgb(image: Image.Image) -> Image.Image:
     """Return a photo in sRGB, as RGB or RGBA; the photo itself if it has no profile, or one of no effect."""
-    change = _change_of(image)
+    change = _find_change(image)
     if change.transform is None:
         return image
     alpha = image.convert("RGBA").getchannel("A") if image.has_transparency_data else None
@@ -44,10 +44,11 @@ def to_srgb(image: Image.Image) -> Image.Image:
     return result
 
 
-def _change_of(image: Image.Image) -> _Change:
+def _find_change(image: Image.Image) -> _Change:
+    """Return the change of colours that makes a photo sRGB, and print its message at its first use."""
     mode = "I;16" if image.mode.startswith("I") else {"LA": "L", "1": "L"}.get(image.mode, image.mode)
     if profile := image.info.get("icc_profile"):
-        change = _read(profile, mode)
+        change = _read_profile(profile, mode)
     elif unknown := image.info.get(UNKNOWN):
         change = _Change(None, said=f"warning: photos are taken as sRGB, though their colours are of {unknown}")
     else:
@@ -60,7 +61,8 @@ def _change_of(image: Image.Image) -> _Change:
 
 
 @functools.lru_cache(maxsize=64)
-def _read(profile: bytes, mode: str) -> _Change:
+def _read_profile(profile: bytes, mode: str) -> _Change:
+    """Return the change of colours of an ICC profile, for images of a Pillow mode; none if it is sRGB or unusable."""
     grey = mode in ("L", "I;16")
     try:
         source, target = ImageCms.ImageCmsProfile(io.BytesIO(profile)), ImageCms.createProfile("sRGB")

@@ -55,7 +55,7 @@ def add_profile(image: Image.Image, path: Path) -> None:
         else:
             return
         if colors != _SRGB or power:
-            image.info["icc_profile"] = _profile(name, tuple(colors), power)
+            image.info["icc_profile"] = _make_profile(name, tuple(colors), power)
 
 
 def code_points(path: Path, kind: str | None) -> tuple[int, int] | None:
@@ -76,6 +76,7 @@ def code_points(path: Path, kind: str | None) -> tuple[int, int] | None:
 
 
 def _is_adobe(image: Image.Image) -> bool:
+    """Tell whether EXIF says that a photo's colours are of Adobe RGB."""
     if "exif" in image.info:
         exif = Image.Exif()  # one of its own, as `get_ifd` adds to what is written later
         exif.load(image.info["exif"])
@@ -97,26 +98,26 @@ def mark_srgb(exif: Image.Exif) -> None:
 
 
 @functools.lru_cache(maxsize=16)
-def _profile(name: str, colors: tuple[float, ...], power: float) -> bytes:
+def _make_profile(name: str, colors: tuple[float, ...], power: float) -> bytes:
     """An ICC profile (ICC.1:2010). colors: x and y of white, red, green and blue. power: 0 for the curve of sRGB."""
     x, y = np.reshape(colors, (4, 2)).T
     white, *primaries = np.stack([x / y, np.ones(4), (1 - x - y) / y], 1)
     columns = np.transpose(primaries) * np.linalg.solve(np.transpose(primaries), white)
     adapted = np.linalg.solve(_BRADFORD, np.diag(_BRADFORD @ _D50 / (_BRADFORD @ white)) @ _BRADFORD @ columns)
     numbers = [power] if power else _CURVE
-    curve = struct.pack(">4s4xH2x", b"para", 0 if power else 3) + _fixed(numbers)
+    curve = struct.pack(">4s4xH2x", b"para", 0 if power else 3) + _encode_fixed_point(numbers)
     text = name.encode("utf-16-be") + b"\0\0" * (len(name) % 2)
     tags = {b"desc": struct.pack(">4s4x2I4s2I", b"mluc", 1, 12, b"enUS", len(text), 28) + text}
-    tags |= {b"wtpt": b"XYZ \0\0\0\0" + _fixed(_D50)}
+    tags |= {b"wtpt": b"XYZ \0\0\0\0" + _encode_fixed_point(_D50)}
     for channel, column in zip((b"r", b"g", b"b"), adapted.T, strict=True):
-        tags |= {channel + b"XYZ": b"XYZ \0\0\0\0" + _fixed(column), channel + b"TRC": curve}
+        tags |= {channel + b"XYZ": b"XYZ \0\0\0\0" + _encode_fixed_point(column), channel + b"TRC": curve}
     start, table, content = 132 + 12 * len(tags), struct.pack(">I", len(tags)), b""
     for tag, data in tags.items():
         table += tag + struct.pack(">2I", start + len(content), len(data))
         content += data
     head = struct.pack(">I4xI4s4s4s12x4s28x", start + len(content), 0x04200000, b"mntr", b"RGB ", b"XYZ ", b"acsp")
-    return (head + _fixed(_D50)).ljust(128, b"\0") + table + content
+    return (head + _encode_fixed_point(_D50)).ljust(128, b"\0") + table + content
 
 
-def _fixed(values: np.ndarray | tuple[float, ...] | list[float]) -> bytes:
+def _encode_fixed_point(values: np.ndarray | tuple[float, ...] | list[float]) -> bytes:
     return np.round(np.asarray(values) * 65536).astype(">i4").tobytes()

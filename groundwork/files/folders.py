@@ -32,7 +32,7 @@ def locked(folder: Path, program: str, busy: str, option: str, inherited: bool =
     """
     path = folder / f".{program.removesuffix('.py')}.lock"
     with contextlib.ExitStack() as stack:
-        file = _acquired(stack, path, busy, option)
+        file = _lock_file(stack, path, busy, option)
         if file is None:
             yield
             return
@@ -48,7 +48,7 @@ def locked(folder: Path, program: str, busy: str, option: str, inherited: bool =
                     path.unlink()
 
 
-def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -> TextIO | None:
+def _lock_file(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -> TextIO | None:
     """Lock the file, which `stack` closes; None where files cannot be locked."""
     latest = time.monotonic() + _LINGER
     while True:
@@ -61,7 +61,7 @@ def _acquired(stack: contextlib.ExitStack, path: Path, busy: str, option: str) -
         except BlockingIOError as error:
             file.seek(0)
             process = file.read().strip() or "not known"
-            if process.isdigit() and not _runs(int(process)) and time.monotonic() < latest:
+            if process.isdigit() and not _is_running(int(process)) and time.monotonic() < latest:
                 file.close()
                 time.sleep(0.05)
                 continue
@@ -88,14 +88,15 @@ def remove_temporary_files(folder: str | os.PathLike) -> list[Path]:
     removed = []
     for parent, _, names in os.walk(folder):
         for name in names:
-            if (match := _TEMPORARY.fullmatch(name)) and not _runs(int(match[1])):
+            if (match := _TEMPORARY.fullmatch(name)) and not _is_running(int(match[1])):
                 with contextlib.suppress(OSError):
                     os.unlink(os.path.join(parent, name))
                     removed.append(Path(parent, name))
     return removed
 
 
-def _runs(process: int) -> bool:
+def _is_running(process: int) -> bool:
+    """Tell whether a process, by its number, runs on this machine."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:

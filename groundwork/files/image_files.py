@@ -115,7 +115,8 @@ def remove_leftovers(folder: Path, count: int) -> None:
 def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | None = None) -> None:
     """Write values (H, W), at least 0, as a 16-bit PNG; whole or not at all.
 
-    Values are rounded to the nearest of 65,536 steps up to `largest`.
+    Values are rounded to the nearest of 65,536 steps up to `largest`. The value of a step stands in the PNG as the text
+    SCALE, by which `read_plane` returns values.
 
     largest: the value of the brightest pixel; None: the largest of the values.
     """

@@ -58,12 +58,12 @@ def read_model_json(model_path: str | os.PathLike) -> dict[str, Any]:
     if not isinstance(record, dict) or not isinstance(record.get("antialiasing", False), bool):
         raise UserError(f"{path}: antialiasing must be true or false; restore the file, or remove it")
     offset = record.get(OFFSET, [0, 0, 0])
-    if not isinstance(offset, list) or len(offset) != 3 or not all(_fits(value) for value in offset):
+    if not isinstance(offset, list) or len(offset) != 3 or not all(_is_coordinate(value) for value in offset):
         raise UserError(
             f"{path}: {OFFSET} must be three numbers to {LARGEST_OFFSET:g}, got {offset!r:.40}; restore the file"
         )
     factor = record.get(ENLARGEMENT, 1.0)
-    if not (_fits(factor) and factor > 0):
+    if not (_is_coordinate(factor) and factor > 0):
         fault = f"must be a number above 0, to {LARGEST_OFFSET:g}, got {factor!r:.40}"
         raise UserError(f"{path}: {ENLARGEMENT} {fault}; restore the file")
     return record
@@ -74,5 +74,5 @@ def write_model_json(model_path: str | os.PathLike, record: dict[str, Any]) -> N
     write_json(Path(model_path) / MODEL_JSON, record)
 
 
-def _fits(value: Any) -> bool:
+def _is_coordinate(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) <= LARGEST_OFFSET

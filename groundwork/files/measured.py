@@ -33,9 +33,9 @@ def measured_record(
     known = Similarity.read(record, "orientation") if before else Similarity(np.eye(3), 1.0, np.zeros(3), upright=False)
     axes, origin = known.rotation, -known.rotation.T @ known.translation / known.scale
     if ground is not None:
-        down = _unit(ground_normal(ground), "the three points of the ground lie on a line; choose others")
+        down = _normalise(ground_normal(ground), "the three points of the ground lie on a line; choose others")
         down = -down if (above - ground[0]) @ down > 0 else down
-        axes, origin = _level(axes, down), ground.mean(0)
+        axes, origin = _level_axes(axes, down), ground.mean(0)
         record["vertical"] = "three points of the ground"
         record.pop("vertical_error", None)
     if front is not None:
@@ -43,7 +43,7 @@ def measured_record(
             raise UserError("a front needs to know what is up; click three points of the ground, too")
         along = front[1] - front[0]
         along /= np.linalg.norm(along).clip(TINY)
-        right = _unit(along - (along @ axes[1]) * axes[1], "the front goes straight up; choose other points")
+        right = _normalise(along - (along @ axes[1]) * axes[1], "the front goes straight up; choose other points")
         axes = np.stack([right, axes[1], np.cross(right, axes[1])])
     if ground is not None or front is not None:
         record = {name: value for name, value in record.items() if name not in PLACE}
@@ -61,7 +61,7 @@ def ground_normal(ground: np.ndarray) -> np.ndarray:
     return np.cross(sides[0], sides[1]) / longest.clip(TINY)
 
 
-def _unit(vector: np.ndarray, fault: str) -> np.ndarray:
+def _normalise(vector: np.ndarray, fault: str) -> np.ndarray:
     """Scale a vector (3,) to length 1. UserError with `fault` if it is not finite, or shorter than 1e-6."""
     length = np.linalg.norm(vector)
     if not 1e-6 <= length < np.inf:
@@ -69,7 +69,7 @@ def _unit(vector: np.ndarray, fault: str) -> np.ndarray:
     return vector / length
 
 
-def _level(axes: np.ndarray, down: np.ndarray) -> np.ndarray:
+def _level_axes(axes: np.ndarray, down: np.ndarray) -> np.ndarray:
     """Turn axes (3,3), by rows, as little as gives them the y axis `down` (3,)."""
     ahead = axes[2] - (axes[2] @ down) * down
     if np.linalg.norm(ahead) < 1e-3:  # it looked straight down

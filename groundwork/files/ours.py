@@ -22,7 +22,7 @@ _MARK = b"3D Gaussian Splatting, sha256 "
 def is_ours(path: Path, owner: str = "") -> bool:
     """Tell whether a picture is unchanged since `write_picture`, or a folder has the digest of its files in its name.
 
-    owner: as for `folder_digest`.
+    owner: name of the file that refers to the folder.
     """
     if path.is_symlink():
         return False
@@ -32,8 +32,8 @@ def is_ours(path: Path, owner: str = "") -> bool:
     if not path.is_file():
         return False
     content = path.read_bytes()
-    start, size = _place(content), len(_chunk(content))
-    return content == _marked(content[:start] + content[start + size :])
+    start, size = _find_offset(content), len(_make_comment(content))
+    return content == _insert_comment(content[:start] + content[start + size :])
 
 
 def folder_digest(folder: Path, owner: str) -> str:
@@ -67,20 +67,20 @@ def write_picture(path: Path, image: Image.Image, **options: object) -> None:
     content = io.BytesIO()
     image.save(content, "PNG" if path.suffix == ".png" else "JPEG", **options)
     with atomic_write(path) as temporary:
-        temporary.write_bytes(_marked(content.getvalue()))
+        temporary.write_bytes(_insert_comment(content.getvalue()))
 
 
-def _marked(picture: bytes) -> bytes:
-    start = _place(picture)
-    return picture[:start] + _chunk(picture) + picture[start:]
+def _insert_comment(picture: bytes) -> bytes:
+    start = _find_offset(picture)
+    return picture[:start] + _make_comment(picture) + picture[start:]
 
 
-def _place(picture: bytes) -> int:
+def _find_offset(picture: bytes) -> int:
     """The offset of the comment: behind the header of a PNG, or the start of a JPEG."""
     return 33 if picture.startswith(b"\x89PNG") else 2
 
 
-def _chunk(picture: bytes) -> bytes:
+def _make_comment(picture: bytes) -> bytes:
     """The comment, of one length for all pictures of a format."""
     text = _MARK + hashlib.sha256(picture).hexdigest().encode()
     if not picture.startswith(b"\x89PNG"):

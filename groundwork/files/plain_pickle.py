@@ -32,6 +32,11 @@ class Machine:
         build: Callable[[Any, Any], None],
         leaves: tuple[type, ...] = (),
     ) -> None:
+        """Prepare to read pickles.
+
+        names: values that a pickle may name. persistent: gives the value of a persistent id. build: sets the state of a
+        value. leaves: types that values may have besides plain ones.
+        """
         self._names, self._persistent, self._build = names, persistent, build
         self._leaves = {*_PLAIN, *leaves}
         self._left = _MOST_OPERATIONS
@@ -43,7 +48,7 @@ class Machine:
             self._spend(1)
             if operation.name == "STOP":
                 break
-            self._do(operation.name, argument)
+            self._carry_out(operation.name, argument)
         (result,) = self._stack
         self._check(result)
         return result
@@ -53,7 +58,8 @@ class Machine:
         if self._left < 0:
             raise ValueError("too long")
 
-    def _do(self, name: str, argument: Any) -> None:
+    def _carry_out(self, name: str, argument: Any) -> None:
+        """Carry out one operation of a pickle, by its name in `pickletools`, on the stack."""
         stack = self._stack
         match name:
             case "PROTO":
@@ -95,6 +101,8 @@ class Machine:
                 raise ValueError("an operation that torch does not write")
 
     def _gather(self, name: str, items: list) -> None:
+        """Gather items into a new tuple, or into the list or dict on top of the stack. name: the operation, in the
+        plural."""
         if name == "TUPLE":
             self._stack.append(tuple(items))
             return
@@ -107,6 +115,7 @@ class Machine:
             target |= plain_dict(zip(items[::2], items[1::2], strict=True))
 
     def _call(self, function: Any, arguments: Any) -> Any:
+        """Call a function of `names` with a tuple of arguments, whose lengths count as operations."""
         if type(function) is not FunctionType or type(arguments) is not tuple:
             raise TypeError("a call of no function")
         # Otherwise a short program could have a long text or list copied at each of its operations.

@@ -19,17 +19,17 @@ def header_lines(path: str | os.PathLike) -> list[str]:
     Other characters than ASCII are replaced, blanks around a line are cut. [] for a file that is no PLY.
     """
     with open(path, "rb") as file:
-        return _header(_single_bytes(file.read(_LONGEST), encoding_of(path)))[0]
+        return _read_header(_encode_text(file.read(_LONGEST), encoding_of(path)))[0]
 
 
-def _single_bytes(content: bytes, encoding: str) -> bytes:
+def _encode_text(content: bytes, encoding: str) -> bytes:
     """Encode the text of a PLY without a mark at its start."""
     if encoding == "utf-8-sig":
         return content.removeprefix(codecs.BOM_UTF8)
     return content.decode(encoding, "replace").encode("ascii", "replace")
 
 
-def _header(begin: bytes) -> tuple[list[str], bytes, int]:
+def _read_header(begin: bytes) -> tuple[list[str], bytes, int]:
     """Return the lines of the header at the start of bytes, their line end, and their number of bytes."""
     if not begin.startswith(b"ply"):
         return [], b"", 0
@@ -64,14 +64,14 @@ def read_elements(path: str | os.PathLike) -> PlyData:
             count = f"{int(rows):,}" if len(rows) < 16 else f"{float(rows):.4g}"
             what = "vertices" if name == "vertex" else f"rows of {name}"
             raise ValueError(f"{count} {what} announced, file ends after {size:,} bytes")
-    return PlyData.read(os.fspath(path) if _is_clean(path) else io.BytesIO(_cleaned(path)))
+    return PlyData.read(os.fspath(path) if _is_clean(path) else io.BytesIO(_clean_content(path)))
 
 
 def _is_clean(path: str | os.PathLike) -> bool:
     """Tell whether plyfile accepts the header, which must be ASCII without blanks around its lines."""
     with open(path, "rb") as file:
         begin = file.read(_LONGEST)
-    lines, newline, size = _header(begin)
+    lines, newline, size = _read_header(begin)
     return (
         bool(lines)
         and all(lines)
@@ -79,8 +79,8 @@ def _is_clean(path: str | os.PathLike) -> bool:
     )
 
 
-def _cleaned(path: str | os.PathLike) -> bytes:
+def _clean_content(path: str | os.PathLike) -> bytes:
     """Return the content of a file with a header that plyfile accepts."""
-    content = _single_bytes(Path(path).read_bytes(), encoding_of(path))
-    lines, newline, size = _header(content[:_LONGEST])
+    content = _encode_text(Path(path).read_bytes(), encoding_of(path))
+    lines, newline, size = _read_header(content[:_LONGEST])
     return newline.join([line.encode("ascii", "replace") for line in lines if line] + [content[size:]])

@@ -68,6 +68,7 @@ def read_tensors(path: str | os.PathLike, *, mapped: bool = False, legacy: bool 
 
 
 def _read_archive(file: BinaryIO, mapped: bool) -> Any:
+    """Read a zip archive of torch.save. mapped: tensors stay in the file. ValueError for another archive."""
     size = os.fstat(file.fileno()).st_size
     with zipfile.ZipFile(file) as archive:
         parts = archive.infolist()
@@ -87,6 +88,7 @@ def _read_archive(file: BinaryIO, mapped: bool) -> Any:
         whole = torch.UntypedStorage.from_file(os.fspath(file.name), False, size) if mapped else None
 
         def stored_bytes(key: str, nbytes: int, _: int) -> torch.UntypedStorage:
+            """Return the storage of a key, mapped from the file where its alignment allows that."""
             part = archive.getinfo(f"{folder}/data/{key}")
             if part.file_size != nbytes:
                 raise ValueError("a storage of another size")
@@ -95,12 +97,12 @@ def _read_archive(file: BinaryIO, mapped: bool) -> Any:
             if whole is not None and start % _ALIGNMENT == 0:
                 return whole[start : start + nbytes]
             file.seek(start)
-            return _filled(torch.UntypedStorage(nbytes), file)
+            return _fill_storage(torch.UntypedStorage(nbytes), file)
 
         pickle = archive.getinfo(f"{folder}/data.pkl")
         if pickle.file_size > MOST_BYTES:
             raise ValueError("too long")
-        return _machine(stored_bytes).read(io.BytesIO(archive.read(pickle)))
+        return _make_machine(stored_bytes).read(io.BytesIO(archive.read(pickle)))
 
 
 def _read_legacy(file: BinaryIO) -> Any:
@@ -109,6 +111,7 @@ def _read_legacy(file: BinaryIO) -> Any:
     storages: dict[str, tuple[torch.UntypedStorage, int]] = {}
 
     def later_filled(key: str, nbytes: int, itemsize: int) -> torch.UntypedStorage:
+        """Return an empty storage of a key, which is filled after the pickle is read."""
         nonlocal left
         left -= nbytes
         if left < 0:
@@ -118,7 +121,7 @@ def _read_legacy(file: BinaryIO) -> Any:
 
     file.seek(0)
     head = io.BytesIO(file.read(MOST_BYTES))
-    machine = _machine(later_filled)
+    machine = _make_machine(later_filled)
     magic, protocol, _ = machine.read(head), machine.read(head), machine.read(head)
     if type(magic) is not int or (magic, protocol) != (_MAGIC, _PROTOCOL):
         raise ValueError("another kind of file")
@@ -131,13 +134,14 @@ def _read_legacy(file: BinaryIO) -> Any:
         storage, count = storages.pop(key)
         if struct.unpack("<q", file.read(8)) != (count,):
             raise ValueError("a storage of another size")
-        _filled(storage, file)
+        _fill_storage(storage, file)
     if storages:
         raise ValueError("storages without values")
     return content
 
 
-def _filled(storage: torch.UntypedStorage, file: BinaryIO) -> torch.UntypedStorage:
+def _fill_storage(storage: torch.UntypedStorage, file: BinaryIO) -> torch.UntypedStorage:
+    """Fill a storage from a file, and return it. EOFError if the file ends before."""
     if storage.nbytes():
         values = torch.empty(0, dtype=torch.uint8, device="cpu").set_(storage).numpy()
         if file.readinto(values) != len(values):
@@ -145,11 +149,12 @@ def _filled(storage: torch.UntypedStorage, file: BinaryIO) -> torch.UntypedStora
     return storage
 
 
-def _machine(stored: Callable[[str, int, int], torch.UntypedStorage]) -> Machine:
+def _make_machine(stored: Callable[[str, int, int], torch.UntypedStorage]) -> Machine:
     """Make a machine for the names that torch.save writes. stored: returns a storage for a key, bytes and item size."""
     known: dict[str, torch.UntypedStorage] = {}
 
     def storage(identity: Any) -> _Storage:
+        """Return the typed storage that a persistent id of torch.save names; each key is read once."""
         if type(identity) is not tuple:
             raise TypeError("a persistent id that torch does not write")
         word, dtype, key, _, count, *view = identity
@@ -167,7 +172,7 @@ def _machine(stored: Callable[[str, int, int], torch.UntypedStorage]) -> Machine
     return Machine(_NAMES, storage, _build, (torch.Tensor, torch.nn.Parameter))
 
 
-def _tensor(
+def _make_tensor(
     storage: Any, offset: Any, size: Any, stride: Any, requires_grad: Any = False, _: Any = None
 ) -> torch.Tensor:
     """Make a tensor; it must lie within its storage and claim no more values than are stored."""
@@ -185,13 +190,13 @@ def _tensor(
     return empty.set_(storage.bytes, offset, size, stride).requires_grad_(requires_grad)
 
 
-def _parameter(data: Any, requires_grad: Any = True, _: Any = None) -> torch.nn.Parameter:
+def _make_parameter(data: Any, requires_grad: Any = True, _: Any = None) -> torch.nn.Parameter:
     if type(data) is not torch.Tensor or type(requires_grad) is not bool:
         raise TypeError("a parameter of wrong types")
     return torch.nn.Parameter(data, requires_grad)
 
 
-def _ordered_dict(pairs: Any = ()) -> dict[str | int, Any]:
+def _make_ordered_dict(pairs: Any = ()) -> dict[str | int, Any]:
     return plain_dict(pairs)
 
 
@@ -202,13 +207,13 @@ def _encode(text: Any, encoding: Any) -> bytes:
     return text.encode("latin1")
 
 
-def _dtype(code: Any, *_: Any) -> _Format:
+def _make_dtype(code: Any, *_: Any) -> _Format:
     if type(code) is not str or code not in ("f4", "f8"):
         raise TypeError("a dtype of NumPy other than float32 and float64")
     return _Format(code)
 
 
-def _scalar(kind: Any, data: Any) -> float:
+def _make_scalar(kind: Any, data: Any) -> float:
     if type(kind) is not _Format or type(data) is not bytes:
         raise TypeError("a scalar of wrong types")
     return struct.unpack({"f4": "<f", "f8": "<d"}[kind.code], data)[0]
@@ -230,13 +235,13 @@ def _build(value: Any, state: Any) -> None:
 
 _NAMES = {
     **{f"torch {name}Storage": dtype for name, dtype in _DTYPES.items()},
-    "torch._utils _rebuild_tensor": _tensor,
-    "torch._utils _rebuild_tensor_v2": _tensor,
-    "torch._utils _rebuild_parameter": _parameter,
-    "torch.nn.parameter Parameter": _parameter,
-    "collections OrderedDict": _ordered_dict,
+    "torch._utils _rebuild_tensor": _make_tensor,
+    "torch._utils _rebuild_tensor_v2": _make_tensor,
+    "torch._utils _rebuild_parameter": _make_parameter,
+    "torch.nn.parameter Parameter": _make_parameter,
+    "collections OrderedDict": _make_ordered_dict,
     "_codecs encode": _encode,
-    "numpy dtype": _dtype,
-    "numpy.core.multiarray scalar": _scalar,
-    "numpy._core.multiarray scalar": _scalar,
+    "numpy dtype": _make_dtype,
+    "numpy.core.multiarray scalar": _make_scalar,
+    "numpy._core.multiarray scalar": _make_scalar,
 }

@@ -40,11 +40,12 @@ class _Running:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._seconds, self._before, self._worked = 0.0, time.monotonic(), _worked()
+        self._seconds, self._before, self._worked = 0.0, time.monotonic(), _read_cpu_seconds()
 
     def seconds(self) -> float:
+        """Return the seconds so far, without the time in which the process was stopped."""
         with self._lock:
-            now, worked = time.monotonic(), _worked()
+            now, worked = time.monotonic(), _read_cpu_seconds()
             passed = now - self._before
             if passed < _STOPPED or worked - self._worked > _WORKED:
                 self._seconds += passed
@@ -52,7 +53,7 @@ class _Running:
             return self._seconds
 
 
-def _worked() -> float:
+def _read_cpu_seconds() -> float:
     """CPU seconds of the main thread; of all threads where the system does not tell."""
     try:
         return time.clock_gettime(time.pthread_getcpuclockid(threading.main_thread().ident))

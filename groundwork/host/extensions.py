@@ -9,7 +9,7 @@ from pathlib import Path
 _SOURCES = Path(__file__).resolve().parents[2] / "submodules"
 
 
-def _check() -> None:
+def _check_extension() -> None:
     """Raise ImportError for an extension that is older than its sources here, or another project's of that name."""
     for sources in sorted(_SOURCES.glob("*/*/ops.py")):
         package, folder = sources.parent.name, sources.parents[1].name
@@ -26,4 +26,4 @@ def _check() -> None:
             )
 
 
-_check()
+_check_extension()

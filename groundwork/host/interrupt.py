@@ -30,6 +30,7 @@ class DeferredInterrupt:
         self._previous = {}
 
     def __enter__(self) -> "DeferredInterrupt":
+        """Take over the signals that end a program, in the main thread; a hangup only where it is not ignored."""
         if threading.current_thread() is threading.main_thread():
             for signum in _ERRORS:
                 if signum != signal.SIGHUP or signal.getsignal(signum) != signal.SIG_IGN:
@@ -39,11 +40,13 @@ class DeferredInterrupt:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Give the signals back to their former handlers."""
         for signum, handler in self._previous.items():
             if handler is not None:
                 signal.signal(signum, handler)
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
+        """Note a signal for later; raise its error at once if one was noted before."""
         if signum == signal.SIGHUP:
             _leave_closed_terminal()
         elif self.requested:

@@ -53,6 +53,7 @@ def missing_code_message(error: BaseException) -> str:
 
 
 def _has_cuda_kernels() -> bool:
+    """Tell whether the rasterizer was built with CUDA kernels; False without the rasterizer."""
     try:
         from diff_gaussian_rasterization import has_cuda_kernels
     except ImportError:  # metrics.py and doctor.py work without the extension
@@ -66,7 +67,7 @@ def cores() -> int:
     Processes that train together on this host share them evenly.
     """
     count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, math.ceil(min(count, _quota())) // torchrun.local_size())
+    return max(1, math.ceil(min(count, _read_quota())) // torchrun.local_size())
 
 
 def threads(most: int = MOST_THREADS) -> int:
@@ -74,7 +75,7 @@ def threads(most: int = MOST_THREADS) -> int:
     return min(cores(), most)
 
 
-def _quota() -> float:
+def _read_quota() -> float:
     """Number of processors that the cgroup and its parents allow (cpu.max of version 2); infinite without a limit."""
     try:
         own = next(line[3:] for line in _OWN_CGROUPS.read_text().splitlines() if line.startswith("0::"))
@@ -127,7 +128,7 @@ def gpu_name() -> str:
 
     fields = "driver_version,clocks.sm,clocks.mem"
     index = f"--id={torch.cuda.current_device()}"
-    state = _output("nvidia-smi", index, f"--query-gpu={fields}", "--format=csv,noheader")
+    state = _run_program("nvidia-smi", index, f"--query-gpu={fields}", "--format=csv,noheader")
     return f"{torch.cuda.get_device_name()} (driver, SM and memory clock: {state or 'not known'})"
 
 
@@ -135,12 +136,12 @@ def commit() -> str:
     """GS_COMMIT if set (for a copy without git), else the checkout's short hash, with + if files differ."""
     if os.environ.get("GS_COMMIT"):
         return os.environ["GS_COMMIT"]
-    short = _output("git", "rev-parse", "--short", "HEAD")
-    changed = _output("git", "status", "--porcelain", "--untracked-files=no")
+    short = _run_program("git", "rev-parse", "--short", "HEAD")
+    changed = _run_program("git", "status", "--porcelain", "--untracked-files=no")
     return (short + ("+" if changed else "")) or "not known (GS_COMMIT is not set)"
 
 
-def _output(*command: str) -> str:
+def _run_program(*command: str) -> str:
     """Output of a program; empty if it is missing or fails."""
     try:
         program = find_program(command[0]) or "/"  # which cannot be run

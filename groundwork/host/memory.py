@@ -62,7 +62,7 @@ def free_memory(device: torch.device | str) -> int | None:
         taken, (free, total) = torch.cuda.memory_allocated(device), torch.cuda.mem_get_info(device)
         most = int(torch.cuda.get_per_process_memory_fraction() * total)
         return max(min(free + torch.cuda.memory_reserved(device), most) - taken, 0)
-    known = [value for value in (_available(), _group_limit(), _process_limit()) if value is not None]
+    known = [value for value in (_read_available(), _read_group_limit(), _read_process_limit()) if value is not None]
     return min(known, default=None)
 
 
@@ -80,7 +80,8 @@ def peak_memory_mib(device: torch.device) -> float | None:
         return None
 
 
-def _available() -> int | None:
+def _read_available() -> int | None:
+    """Read the bytes of memory that are available, from Linux; None on other systems."""
     with contextlib.suppress(OSError, ValueError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -88,7 +89,7 @@ def _available() -> int | None:
     return None
 
 
-def _group_limit() -> int | None:
+def _read_group_limit() -> int | None:
     """Bytes below the limit of this process's control group (version 2, or 1); None without a limit."""
     for limit, used in (
         ("memory.max", "memory.current"),
@@ -102,7 +103,7 @@ def _group_limit() -> int | None:
     return None
 
 
-def _process_limit() -> int | None:
+def _read_process_limit() -> int | None:
     """Bytes of address space left to this process; None without a limit."""
     if (most := resource.getrlimit(resource.RLIMIT_AS)[0]) == resource.RLIM_INFINITY:
         return None

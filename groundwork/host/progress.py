@@ -47,6 +47,7 @@ class Bar(tqdm):
         return None
 
     def _write(self) -> None:
+        """Write the bar's text as a line of its own, unless it is the line before."""
         self._shown, line = time.monotonic(), str(self).strip()
         if line != self._line:
             self._line = line

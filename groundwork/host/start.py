@@ -147,13 +147,13 @@ def typed_command(script: str) -> str:
     The latter is called python, if that is it.
     """
     found, own = find_program("python"), Path(sys.executable)
-    python = "python" if found and Path(found).absolute() == own.absolute() else _typed(own)
+    python = "python" if found and Path(found).absolute() == own.absolute() else _quote_path(own)
     if script.startswith("-m "):
-        place = "" if Path.cwd() == _ROOT else f"PYTHONPATH={_typed(_ROOT)} "
+        place = "" if Path.cwd() == _ROOT else f"PYTHONPATH={_quote_path(_ROOT)} "
         return f"{place}{python} {script}"
-    return f"{python} {_typed(_ROOT / script)}"
+    return f"{python} {_quote_path(_ROOT / script)}"
 
 
-def _typed(path: Path) -> str:
+def _quote_path(path: Path) -> str:
     here = Path.cwd()
     return shlex.quote(str(path.relative_to(here) if here in path.parents and here != here.parent else path))

@@ -38,7 +38,7 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
     outcome: runs a function and returns its exit status and the message to print; raises errors that it does not know.
     """
     rank = torchrun.rank()
-    with contextlib.nullcontext() if rank == 0 else _silence():
+    with contextlib.nullcontext() if rank == 0 else _silence_output():
         try:
             status, line = outcome(lambda: _join_and_run(main))
         except SystemExit as end:  # of argparse, which has said why
@@ -62,7 +62,7 @@ def run_together(main: Callable[[], object], outcome: Callable[[Callable[[], obj
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
+def _silence_output() -> Iterator[None]:
     """Print nothing and show no progress bar: only rank 0 does."""
     tqdm.__init__ = partialmethod(tqdm.__init__, disable=True)
     with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
@@ -75,7 +75,8 @@ def _is_lost(error: RuntimeError) -> bool:
 
 
 def _join_and_run(main: Callable[[], object]) -> None:
-    device = _own_device()
+    """Join the group of processes that torchrun has started, and run `main` in it with its ranks."""
+    device = _choose_device()
     by_gpu = device.type == "cuda"
     store, rank, size = next(dist.rendezvous("env://", timeout=TIMEOUT))
     # torchrun's store outlives a restart of all ranks, and the notes of those before it are not for these.
@@ -84,13 +85,15 @@ def _join_and_run(main: Callable[[], object]) -> None:
     os.environ.setdefault("TORCH_NCCL_WAIT_TIMEOUT_DUMP_MILSEC", "1000")  # else a minute more after the limit
     dist.init_process_group(store=store, rank=rank, world_size=size, timeout=TIMEOUT, **options)
     ranks = SeveralRanks()
-    refuse_differences(ranks.all_gather_objects(_machine(device)), "start all ranks with the same installation")
+    refuse_differences(
+        ranks.all_gather_objects(_describe_machine(device)), "start all ranks with the same installation"
+    )
     with using(ranks):
         main()
     ranks.leave()
 
 
-def _own_device() -> torch.device:
+def _choose_device() -> torch.device:
     """Choose this rank's device, and make a GPU the current one. Ranks of a host share its cores."""
     device = compute_device()
     if os.environ.get("OMP_NUM_THREADS", "1") == "1":  # which torchrun sets where the user does not
@@ -104,6 +107,6 @@ def _own_device() -> torch.device:
     return device
 
 
-def _machine(device: torch.device) -> dict[str, str]:
+def _describe_machine(device: torch.device) -> dict[str, str]:
     facts = {"torch": torch.__version__, "the backend": device.type, "the instruction set": instruction_set()}
     return facts | ({"the GPU": device_name(device)} if device.type == "cuda" else {})

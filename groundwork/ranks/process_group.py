@@ -25,6 +25,7 @@ class SeveralRanks(Ranks):
     """
 
     def __init__(self) -> None:
+        """Take rank and size from torch's process group, and make a group on the CPU for numbers."""
         self.rank, self.size = dist.get_rank(), dist.get_world_size()
         by_gpu = dist.get_backend() == "nccl"
         self._place = "cuda" if by_gpu else "cpu"  # of what the default group sends
@@ -51,6 +52,10 @@ class SeveralRanks(Ranks):
     def broadcast_from(
         self, holder: int, values: Tensor | None, shape: Sequence[int], dtype: torch.dtype, device: torch.device
     ) -> Tensor:
+        """Send `values` from the rank `holder` to all others; each returns them on its device.
+
+        shape, dtype: of the values, which other ranks do not have (None). device: where others want them.
+        """
         if self.rank == holder:
             dist.broadcast(values.detach().contiguous().to(self._place), holder)
             return values
@@ -64,6 +69,11 @@ class SeveralRanks(Ranks):
         return box
 
     def all_gather_ints(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
+        """Gather the numbers (K,) int64 of all ranks: a row for each rank.
+
+        meanwhile: is called while they travel. The ranks' flags and piggybacked numbers travel along, to save a
+        message.
+        """
         news = torch.tensor(self._piggybacked, device=self._place) if any(self._piggybacked) else self._silence
         flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
         found = read_later(self._all_gather(torch.cat((numbers.to(self._place), flag, news))))
@@ -98,14 +108,18 @@ class SeveralRanks(Ranks):
         return total.to(values.device)
 
     def send(self, rows: Tensor, sizes: Sequence[int], counts: Sequence[int] | None = None) -> tuple[Tensor, list[int]]:
-        counts = self._counts(sizes) if counts is None else list(counts)
+        """Send rows (N, ...) to all ranks, and return the rows received with their number from each rank.
+
+        sizes: number of rows for each rank. counts: number of rows from each rank, None: asked of them.
+        """
+        counts = self._exchange_counts(sizes) if counts is None else list(counts)
         sent = rows.detach().to(self._place).contiguous()
         received = sent.new_empty(sum(counts), *rows.shape[1:])
         if all(rows.shape[1:]):
             dist.all_to_all_single(received, sent, counts, list(sizes))
         return received.to(rows.device), counts
 
-    def _counts(self, sizes: Sequence[int]) -> list[int]:
+    def _exchange_counts(self, sizes: Sequence[int]) -> list[int]:
         """Exchange row counts: this rank sends sizes[r] rows to rank r; returns how many each rank sends here."""
         sent = torch.tensor(sizes, dtype=torch.int64, device=self._place)
         counts = torch.empty_like(sent)

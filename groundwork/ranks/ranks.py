@@ -166,15 +166,15 @@ def refuse_differences(facts: Sequence[Mapping[str, str]], remedy: str, shown: b
         names = [name for name in {**first, **others} if first.get(name) != others.get(name)]
         if names:
             raise UserError(
-                f"rank {rank} differs from rank 0 in {some(_described(names, first, others, shown))}; {remedy}"
+                f"rank {rank} differs from rank 0 in {some(_tell_apart(names, first, others, shown))}; {remedy}"
             )
 
 
-def _described(names: Sequence[str], first: Mapping[str, str], other: Mapping[str, str], shown: bool) -> list[str]:
+def _tell_apart(names: Sequence[str], first: Mapping[str, str], other: Mapping[str, str], shown: bool) -> list[str]:
     if not shown:
         return list(names)
-    return [f"{name} ({_short(other.get(name))}, not {_short(first.get(name))})" for name in names]
+    return [f"{name} ({_shorten(other.get(name))}, not {_shorten(first.get(name))})" for name in names]
 
 
-def _short(value: str | None) -> str:
+def _shorten(value: str | None) -> str:
     return "nothing" if value is None else value if len(value) <= _SHORT else value[:_SHORT] + "..."

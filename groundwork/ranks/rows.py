@@ -87,7 +87,7 @@ class Shards:
         rows = ((weights > 0) & weights.isfinite()).nonzero().reshape(-1)
         if self.ranks.offset_and_total(len(rows))[1] <= count:
             return rows
-        waits = -log(_uniform(random_bits(seed, stream, iteration, rows + self.first))) / weights[rows]
+        waits = -log(_make_uniform(random_bits(seed, stream, iteration, rows + self.first))) / weights[rows]
         return rows[self.lowest(waits, count)].sort().values
 
     def lowest(self, values: Tensor, count: int, *, highest: bool = False) -> Tensor:
@@ -177,6 +177,7 @@ class Divided(Shards):
         return own_rows(values, self.ranks)
 
     def gather_whole(self, values: Tensor) -> Tensor:
+        """Gather the rows of all processes in the first one, on the CPU; others get no rows."""
         total = self.ranks.offset_and_total(len(values))[1]
         every = torch.empty(total if self.ranks.first else 0, *values.shape[1:], dtype=values.dtype)
         filled = 0
@@ -194,6 +195,7 @@ class Divided(Shards):
 
     @contextmanager
     def changing(self, gaussians: Any) -> Iterator[None]:
+        """Let rows be added or removed while the context lasts, then divide all rows among the processes again."""
         if self.keys is not None:
             yield
             return
@@ -235,12 +237,13 @@ class Divided(Shards):
         gaussians.shards = self.resized(moves.count)
 
     def match_steps(self, optimizer: torch.optim.Optimizer | None) -> None:
+        """Give the optimiser of each process the order of states and the step counts of the last process."""
         if optimizer is None:
             return
         params, states = [group["params"][0] for group in optimizer.param_groups], optimizer.state
         make = getattr(optimizer, "state_of", None)
         order = {param: number for number, param in enumerate(states)}
-        mine = [number for param in params for number in (order.get(param, -1), _steps(states.get(param, {})))]
+        mine = [number for param in params for number in (order.get(param, -1), _count_steps(states.get(param, {})))]
         last = self.ranks.all_gather_host_ints(*mine)[-1].reshape(-1, 2).tolist()
         for place, steps, index in sorted((*numbers, index) for index, numbers in enumerate(last)):
             param = params[index]
@@ -324,11 +327,11 @@ class Redistribution:
         return moved
 
 
-def _uniform(bits: Tensor) -> Tensor:
+def _make_uniform(bits: Tensor) -> Tensor:
     """Numbers in (0, 1), odd multiples of 2^-53, from rows of 32-bit numbers (n, 4): (n,) float64."""
     whole = (bits[:, 0] << 20) | (bits[:, 1] >> 12)
     return (2 * whole + 1).to(torch.float64) * 2.0**-53
 
 
-def _steps(state: dict[str, Any]) -> int:
+def _count_steps(state: dict[str, Any]) -> int:
     return int(state.get("step", 0))

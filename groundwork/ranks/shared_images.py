@@ -48,12 +48,16 @@ class SharedImage:
         """
         mine = None
         if self._form is None:
-            mine, self._form = self._decoded()
+            mine, self._form = self._decode_in_holder()
         elif self._ranks.rank == self._holder:
             mine = self._own()
         return self._ranks.broadcast_from(self._holder, mine, *self._form, self._device)
 
-    def _decoded(self) -> tuple[Tensor | None, tuple[torch.Size, torch.dtype]]:
+    def _decode_in_holder(self) -> tuple[Tensor | None, tuple[torch.Size, torch.dtype]]:
+        """Decode the image in its holder's process; return it, None elsewhere, and its shape and dtype in all.
+
+        UserError in all processes where the holder cannot decode it.
+        """
         mine = said = None
         if self._ranks.rank == self._holder:
             try:

@@ -50,8 +50,8 @@ def check_cameras(info: SceneInfo) -> Iterator[Finding]:
     """Check forms of poses, lenses, sides and places of the cameras."""
     yield from check_pose_forms(info)
     yield from check_lens_shapes(info)
-    yield from _exchanged([*info.train_cameras, *info.test_cameras])
-    yield from _places(info)
+    yield from _check_sides([*info.train_cameras, *info.test_cameras])
+    yield from _check_places(info)
 
 
 def check_pose_forms(info: SceneInfo) -> Iterator[Finding]:
@@ -72,18 +72,18 @@ def check_pose_forms(info: SceneInfo) -> Iterator[Finding]:
 def check_lens_shapes(info: SceneInfo) -> Iterator[Finding]:
     """Check rounding, opening angles and principal points: causes by which points may not fit the photos."""
     views = [*info.train_cameras, *info.test_cameras]
-    yield from _rounded(info, views)
-    pinholes = [view for view in views if _chart(view) != "equirectangular"]
-    yield from _angles(pinholes)
-    yield from _principal_points(pinholes)
+    yield from _check_rounding(info, views)
+    pinholes = [view for view in views if _find_chart(view) != "equirectangular"]
+    yield from _check_angles(pinholes)
+    yield from _check_principal_points(pinholes)
 
 
-def _chart(view: CameraInfo) -> str:
+def _find_chart(view: CameraInfo) -> str:
     native = getattr(view, "native", None)
     return native.chart if native else "perspective"
 
 
-def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
+def _check_rounding(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
     """Find large coordinates, as of maps, that were written with too few digits for the scene's extent."""
     if not (info.offset.any() and info.extent) or any(check_pose_forms(info)):
         return
@@ -92,8 +92,8 @@ def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
     points = np.zeros((0, 3)) if info.point_cloud is None else np.asarray(info.point_cloud.points, np.float64)
     least = _STEP * info.extent
     steps = {
-        "cameras": _step(centers, least) or _step(moves, least),
-        "points": _step(points[:: 1 + len(points) // _SAMPLE] + info.offset, least),
+        "cameras": _find_step(centers, least) or _find_step(moves, least),
+        "points": _find_step(points[:: 1 + len(points) // _SAMPLE] + info.offset, least),
     }
     if told := [f"the {what} to steps of {step:.2g}" for what, step in steps.items() if step]:
         text = f"coordinates are rounded: {', '.join(told)}, in a scene with an extent of {info.extent:.3g}"
@@ -101,7 +101,7 @@ def _rounded(info: SceneInfo, views: Sequence[CameraInfo]) -> Iterator[Finding]:
         yield Finding(text, remedy)
 
 
-def _step(values: np.ndarray, least: float) -> float | None:
+def _find_step(values: np.ndarray, least: float) -> float | None:
     """The step, at least `least`, to which the largest values are rounded: by decimal digits, or as float32."""
     size = np.abs(values)
     if not np.isfinite(size).all() or not size.any():
@@ -119,7 +119,7 @@ def _step(values: np.ndarray, least: float) -> float | None:
     return None
 
 
-def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
+def _check_sides(views: Sequence[CameraInfo]) -> Iterator[Finding]:
     """Find photos whose width is their camera's height; our own readers refuse them."""
     wrong = [(view, size) for view in views if are_exchanged(size := photo_size(view), (view.width, view.height))]
     if wrong:
@@ -130,17 +130,17 @@ def _exchanged(views: Sequence[CameraInfo]) -> Iterator[Finding]:
 
 def opening(view: CameraInfo) -> tuple[float, float]:
     """Horizontal and vertical opening angles of a view, degrees."""
-    if _chart(view) == "equidistant":
+    if _find_chart(view) == "equidistant":
         return tuple(np.degrees([view.width / view.fx, view.height / view.fy]).tolist())
     return tuple(np.degrees([view.FovX, view.FovY]).tolist())
 
 
-def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
+def _check_angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
     """Find unusual opening angles, and pixels that are far from square."""
     odd: Counter[str] = Counter()
     examples: dict[str, tuple[CameraInfo, float]] = {}
     for view in views:
-        low, high = _FISHEYE if _chart(view) == "equidistant" else OPENING
+        low, high = _FISHEYE if _find_chart(view) == "equidistant" else OPENING
         angle = max(opening(view))
         if low <= angle <= high:
             continue
@@ -160,7 +160,7 @@ def _angles(views: Sequence[CameraInfo]) -> Iterator[Finding]:
         yield Finding(text, "check the focal lengths and the size of the photos")
 
 
-def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
+def _check_principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
     """Find principal points at an edge or near a corner of the photo; a crop of a larger photo may have any."""
     odd = []
     for view in views:
@@ -175,7 +175,7 @@ def _principal_points(views: Sequence[CameraInfo]) -> Iterator[Finding]:
         yield Finding(text, "give cx and cy in pixels of a photo of that size, or leave them out")
 
 
-def _places(info: SceneInfo) -> Iterator[Finding]:
+def _check_places(info: SceneInfo) -> Iterator[Finding]:
     """Find cameras in one place, or far away from the others."""
     cameras = info.train_cameras
     centers = camera_centers(cameras)

@@ -37,7 +37,10 @@ def is_unfinished(source: str | os.PathLike) -> bool:
 
 
 def awaits_conversion(source: str | os.PathLike) -> bool:
-    """Return True for a folder of photos or videos without cameras, and for one whose conversion ended early."""
+    """Return True if train.py should run convert.py first: on photos or videos without cameras, or to end a conversion.
+
+    False for one of several processes of torchrun, and for a folder that is part of a scene.
+    """
     folder = Path(source)
     if not folder.is_dir() or torchrun.size() > 1 or (is_scene(folder) and not is_unfinished(folder)):
         return False

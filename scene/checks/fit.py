@@ -7,8 +7,8 @@ import numpy as np
 
 from groundwork.finding import Finding, fine, from_error
 from scene.dataset_readers import CameraInfo, SceneInfo
-from scene.readers.tracks import Track, rays_to, read_tracks
-from scene.reprojection import BOUND, nearest_pose, pull
+from scene.readers.tracks import PhotoPoints, rays_to, read_tracks
+from scene.reprojection import BOUND, nearest_pose, pose_loss
 from utils.graphics_utils import world_to_camera
 from utils.system_utils import UserError
 
@@ -36,18 +36,18 @@ def check_geometry(source: str, info: SceneInfo) -> Iterator[Finding]:
     yield from [*check_focal(views, tracks)] or check_poses(views, tracks, info.extent)
 
 
-def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> Iterator[Finding]:
+def check_focal(views: Sequence[CameraInfo], tracks: Sequence[PhotoPoints | None]) -> Iterator[Finding]:
     """Find another focal length, or another unit of the points, that fits the tracks far better."""
     step = max(1, len(views) // COMPARED)
     pairs = [pair for pair in zip(views[::step], tracks[::step], strict=True) if pair[1] is not None]
     if not pairs:
         return
-    given = np.array([_median_miss(view, track) for view, track in pairs])
-    units = {k: np.array([_median_miss(*pair, unit=k) for pair in pairs]) for k in UNITS}
+    given = np.array([_measure_median_miss(view, photo) for view, photo in pairs])
+    units = {k: np.array([_measure_median_miss(*pair, unit=k) for pair in pairs]) for k in UNITS}
     unit = min(units, key=lambda k: np.median(units[k]))
     # The rays are those of the given focal length, so that they are too short where that is too long.
-    factor = float(np.median([_focal_factor(*pair) for pair in pairs]))
-    longer = np.array([_median_miss(*pair, factor=factor) for pair in pairs])
+    factor = float(np.median([_compute_focal_factor(*pair) for pair in pairs]))
+    longer = np.array([_measure_median_miss(*pair, factor=factor) for pair in pairs])
     best = units[unit] if np.median(units[unit]) < np.median(longer) else longer
     if (best < _ADJUSTED * given).mean() < _MOST:
         return
@@ -59,30 +59,30 @@ def check_focal(views: Sequence[CameraInfo], tracks: Sequence[Track | None]) -> 
         yield Finding(text, f"scale the points by {unit:g}")
 
 
-def _focal_factor(view: CameraInfo, track: Track) -> float:
-    """The focal length that fits a track best, as a factor of the given one."""
-    places = np.nan_to_num(rays_to(track.points @ view.R + view.T, track.angular))
-    return float(np.median((track.rays * places).sum(axis=1) / np.maximum((places**2).sum(axis=1), 1e-9)))
+def _compute_focal_factor(view: CameraInfo, photo: PhotoPoints) -> float:
+    """Compute the focal length that fits a photo's points best, as a factor of the given one."""
+    places = np.nan_to_num(rays_to(photo.points @ view.R + view.T, photo.angular))
+    return float(np.median((photo.rays * places).sum(axis=1) / np.maximum((places**2).sum(axis=1), 1e-9)))
 
 
-def _median_miss(view: CameraInfo, track: Track, unit: float = 1.0, factor: float = 1.0) -> float:
+def _measure_median_miss(view: CameraInfo, photo: PhotoPoints, unit: float = 1.0, factor: float = 1.0) -> float:
     """Median distance of points from their rays, in parts of the focal length."""
-    places = rays_to(unit * track.points @ view.R + view.T, track.angular)
-    away = np.linalg.norm(track.rays - factor * places, axis=1)
+    places = rays_to(unit * photo.points @ view.R + view.T, photo.angular)
+    away = np.linalg.norm(photo.rays - factor * places, axis=1)
     return float(np.median(np.where(np.isnan(away), np.inf, away)))
 
 
 def pose_errors(
-    views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float
+    views: Sequence[CameraInfo], tracks: Sequence[PhotoPoints | None], extent: float
 ) -> tuple[float, float] | None:
     """Median reprojection error (pixels) of COMPARED views, with given poses and with the best; None: no tracks."""
     errors, step = [], max(1, len(views) // COMPARED)
-    for view, track in zip(views[::step], tracks[::step], strict=True):
-        if track is None:
+    for view, photo in zip(views[::step], tracks[::step], strict=True):
+        if photo is None:
             continue
         given = world_to_camera(view.R, view.T)
-        best = nearest_pose(given, track, view.fx, extent, BOUND)
-        errors.append([np.median(pull(pose, track, view.fx, extent).size) for pose in (given, best)])
+        best = nearest_pose(given, photo, view.fx, extent, BOUND)
+        errors.append([np.median(pose_loss(pose, photo, view.fx, extent).size) for pose in (given, best)])
     return tuple(np.median(errors, axis=0).tolist()) if errors else None
 
 
@@ -91,7 +91,7 @@ def poses_differ(given: float, best: float) -> bool:
     return given > _SEEN and best < _ADJUSTED * given
 
 
-def check_poses(views: Sequence[CameraInfo], tracks: Sequence[Track | None], extent: float) -> Iterator[Finding]:
+def check_poses(views: Sequence[CameraInfo], tracks: Sequence[PhotoPoints | None], extent: float) -> Iterator[Finding]:
     """Find poses that are far from the best ones, which they cannot be after a bundle adjustment."""
     found = pose_errors(views, tracks, extent)
     if found is None:

@@ -33,7 +33,7 @@ def check_duplicates(info: SceneInfo, halves: bool = False) -> Iterator[Finding]
     """Find photos that several views have. halves: test views are also training views, on purpose."""
     train = info.train_cameras
     tests = [] if halves else list(info.test_cameras)
-    groups = [group for group in _same_photos([*train, *tests]) if len(group) > 1]
+    groups = [group for group in _find_same_photos([*train, *tests]) if len(group) > 1]
     if not groups:
         return
     if len(groups[0]) == len(train) + len(tests):
@@ -61,7 +61,7 @@ def check_duplicates(info: SceneInfo, halves: bool = False) -> Iterator[Finding]
         yield Finding(text, "take one of each out of the scene")
 
 
-def _same_photos(views: Sequence[CameraInfo]) -> Iterator[list[int]]:
+def _find_same_photos(views: Sequence[CameraInfo]) -> Iterator[list[int]]:
     """Indexes of views with the same photo, by file or by content."""
     by_size, by_content = defaultdict(lambda: defaultdict(list)), defaultdict(list)
     for number, view in enumerate(views):
@@ -70,7 +70,7 @@ def _same_photos(views: Sequence[CameraInfo]) -> Iterator[list[int]]:
             by_size[os.path.getsize(path) if os.path.isfile(path) else path][os.path.realpath(path)].append(number)
     for size, paths in by_size.items():
         for path, numbers in paths.items():
-            by_content[size, _digest(path, size) if len(paths) > 1 else path] += numbers
+            by_content[size, _hash_parts(path, size) if len(paths) > 1 else path] += numbers
     for (size, _), numbers in by_content.items():
         whole = defaultdict(list)  # photos without compression share much
         for number in numbers:
@@ -80,7 +80,7 @@ def _same_photos(views: Sequence[CameraInfo]) -> Iterator[list[int]]:
         yield from map(sorted, whole.values())
 
 
-def _digest(path: str, size: int) -> bytes:
+def _hash_parts(path: str, size: int) -> bytes:
     """Hash the start, the middle and the end of a file of `size` bytes."""
     digest = hashlib.sha1(usedforsecurity=False)
     with open(path, "rb") as file:
@@ -136,11 +136,11 @@ def sharpness(pixels: np.ndarray) -> float:
     grey = pixels.mean(2, dtype=np.float32)
     if min(grey.shape) <= 2 * _COARSE:
         return np.nan
-    energies = ((_curvature(grey, step), _curvature(grey, step * _COARSE)) for step in _DIRECTIONS)
+    energies = ((_measure_curvature(grey, step), _measure_curvature(grey, step * _COARSE)) for step in _DIRECTIONS)
     return min((fine / coarse for fine, coarse in energies if coarse > 0.5), default=np.nan)
 
 
-def _curvature(grey: np.ndarray, step: np.ndarray) -> float:
+def _measure_curvature(grey: np.ndarray, step: np.ndarray) -> float:
     """Mean square of second differences at a step (rows, columns)."""
     margin = np.abs(step)
 

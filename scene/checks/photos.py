@@ -102,7 +102,9 @@ def check_photos(views: Sequence[Any], most: int, has_alpha: bool = True, place:
     for cause, remedy in _HIDDEN.items():
         if hidden := [look for look in looks if look.hidden_by == cause]:
             severity = Severity.HOPELESS if len(hidden) == len(looks) else Severity.PROBLEM
-            yield Finding(f"{_of(hidden, looks)} show nothing, as every pixel is left out by {cause}", remedy, severity)
+            yield Finding(
+                f"{_describe_part(hidden, looks)} show nothing, as every pixel is left out by {cause}", remedy, severity
+            )
     yield from check_shared([look for look in looks[:LOOKED_AT] if not look.hidden_by], Path(place))
 
 
@@ -143,7 +145,7 @@ def looks_at(views: Sequence[Any], most: int, has_alpha: bool = True) -> list[Lo
     order, looks, decoded = np.random.default_rng(0).permutation(len(views)), [], 0.0
     for number in order[:most]:
         try:
-            look, cost = _look(views[number], has_alpha)
+            look, cost = _reduce_photo(views[number], has_alpha)
         except (*UNREADABLE, UserError, AttributeError):
             continue  # of a reader that reads photos from elsewhere
         looks.append(look)
@@ -153,14 +155,14 @@ def looks_at(views: Sequence[Any], most: int, has_alpha: bool = True) -> list[Lo
     return looks
 
 
-def _look(view: Any, has_alpha: bool) -> tuple[Look, float]:
+def _reduce_photo(view: Any, has_alpha: bool) -> tuple[Look, float]:
     """Reduce a view's photo; also return the number of pixels that were decoded."""
     if (image := getattr(view, "image", None)) is None:
         with open_image(Path(view.image_path)) as image:
             size, cost = image.size, image.width * image.height * (_JPEG if image.format == "JPEG" else 1)
-            pixels = _rgba(image)
+            pixels = _to_rgba(image)
     elif isinstance(image, Image.Image):
-        pixels, size, cost = _rgba(image), image.size, image.width * image.height
+        pixels, size, cost = _to_rgba(image), image.size, image.width * image.height
     else:
         pixels, cost = image.pixels.permute(1, 2, 0), 0  # scene.images.store.InMemory
         size = tuple(pixels.shape[1::-1])
@@ -179,10 +181,10 @@ def _look(view: Any, has_alpha: bool) -> tuple[Look, float]:
     return Look(view.image_name, pixels[..., :3], visible, kept, size), cost
 
 
-def _rgba(image: Image.Image) -> np.ndarray:
+def _to_rgba(image: Image.Image) -> np.ndarray:
     return shrunk(image, "RGBA" if image.has_transparency_data else "RGB", _PIXELS)
 
 
-def _of(part: Sequence[Look], looks: Sequence[Look]) -> str:
+def _describe_part(part: Sequence[Look], looks: Sequence[Look]) -> str:
     names = f" ({some(sorted(look.name for look in part))})" if len(part) < len(looks) else ""
     return f"{len(part)} of the {len(looks)} photos that were looked at{names}"

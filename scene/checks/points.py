@@ -38,8 +38,8 @@ def check_points(info: SceneInfo) -> Iterator[Finding]:
     points = np.asarray(info.point_cloud.points, dtype=np.float64)
     if not np.isfinite(points).all():
         return  # which is refused with the model's start
-    yield from _far(points, info)
-    yield from _unseen(points, info)
+    yield from _find_far_points(points, info)
+    yield from _find_unseen_points(points, info)
     places = clusters_of(points)
     if places.hides_spacing:
         text = f"{places.shared:.0%} of the {len(points)} points share a place with others"
@@ -47,7 +47,7 @@ def check_points(info: SceneInfo) -> Iterator[Finding]:
         yield Finding(text, "remove the copies from the cloud, as a program that merges clouds may have left them")
 
 
-def _far(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
+def _find_far_points(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
     """Find points far behind everything that the photos show."""
     away = np.linalg.norm(points - camera_centers(info.train_cameras).mean(axis=0), axis=1)
     far = (away > FAR_POINT * (info.extent or np.inf)).mean()
@@ -56,7 +56,7 @@ def _far(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
         yield Finding(text, "remove them from the cloud (COLMAP: filter by reprojection error and angle)")
 
 
-def _unseen(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
+def _find_unseen_points(points: np.ndarray, info: SceneInfo) -> Iterator[Finding]:
     """Find points in no photo, and photos without points."""
     count = min(_SAMPLE, max(200, _TESTS // len(info.train_cameras)))
     sample = points[:: max(1, len(points) // count)]

@@ -62,9 +62,12 @@ def report(found: list[Finding], source: str | os.PathLike, quiet: bool = False)
 
 
 def check_scene(scene: Scene, options: argparse.Namespace, resumed: bool) -> None:
-    """Refuse a scene that cannot be trained (UserError), warn of its faults, and say where its frame is another.
+    """Check a scene before a training: raise a UserError if it cannot be trained, and print warnings of its faults.
 
-    A resumed training goes on in spite of faults that its start was warned of.
+    Messages also tell of photos left out or changed since the conversion, and of an offset or a factor between the
+    scene's coordinates and those of the training.
+
+    options: the model options. resumed: faults are not looked for again, as the start has warned of them.
     """
     info, views = scene.info, scene.getTrainCameras()
     for text in filter(None, (describe_left_out(options.source_path), describe_changed_photos(options.source_path))):
@@ -93,17 +96,17 @@ def check_dataset(source: str, images: str, masks: MaskOptions = NO_MASKS) -> li
         with contextlib.redirect_stderr(said):
             info = read_scene(source, images, hold_out=False, masks=masks, native=True)
     except UserError as error:
-        return [*_notes(said.getvalue()), from_error(error)]
+        return [*_collect_notes(said.getvalue()), from_error(error)]
     views = info.train_cameras
     checks = [check_views(views), check_lenses(source, views), check_extent(info), check_cloud(info)]
     found = findings(info, argparse.Namespace(source_path=source, images=images), most=MOST_PHOTOS)
     checks += [found, check_blur(info, MOST_PHOTOS)]
     if not any(check_lens_shapes(info)) and not has_shared_pixels(found):  # else poses have that cause
         checks += [check_geometry(source, info), check_agreement(Path(source) / "sparse" / "0")]
-    return [*_notes(said.getvalue()), *check_conversion(source), *chain(*checks)]
+    return [*_collect_notes(said.getvalue()), *check_conversion(source), *chain(*checks)]
 
 
-def _notes(said: str) -> list[Finding]:
+def _collect_notes(said: str) -> list[Finding]:
     """Turn the messages that readers printed, without progress bars, into notes."""
     texts = [text.strip() for text in said.replace("\r", "\n").splitlines() if text.strip() and "%|" not in text]
     return [note(text) for text in texts]

@@ -27,13 +27,13 @@ def shared_pixels(photos: np.ndarray, seen: np.ndarray) -> np.ndarray:
     photos = photos.astype(np.int16)
     differing, few = [], photos[:, ::_STEP, ::_STEP]
     for n, photo in enumerate(few):
-        if all((_away(photo, few[k]) <= _NEAR).mean() < _EQUAL for k in differing):
+        if all((_measure_difference(photo, few[k]) <= _NEAR).mean() < _EQUAL for k in differing):
             differing.append(n)
     found = np.zeros(photos.shape[1:3], bool)
     if len(differing) < _FEWEST:
         return found
     usual = np.median(photos[differing], axis=0)
-    agreeing = ((_away(photos[differing], usual) <= _NEAR) & seen[differing]).mean(0)
+    agreeing = ((_measure_difference(photos[differing], usual) <= _NEAR) & seen[differing]).mean(0)
     equal = agreeing >= _NEARLY_ALL
     if equal.mean() < _LEAST:
         return found
@@ -47,13 +47,13 @@ def shared_pixels(photos: np.ndarray, seen: np.ndarray) -> np.ndarray:
         inner, outer = (ndimage.binary_dilation(region, iterations=BORDER * times) for times in (1, 2))
         beside = agreeing[outer & ~inner & ~equal]
         colors = usual[region]
-        is_plain = (_away(colors, np.median(colors, axis=0)) <= 2 * _NEAR).mean() > _PLAIN
+        is_plain = (_measure_difference(colors, np.median(colors, axis=0)) <= 2 * _NEAR).mean() > _PLAIN
         if not is_plain or (beside.size and (beside < 0.5).mean() > _SHARP):
             found |= region
     return found if found.mean() >= _LEAST else np.zeros_like(found)
 
 
-def _away(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
+def _measure_difference(colors: np.ndarray, others: np.ndarray) -> np.ndarray:
     """The largest difference of a channel, of colours (..., 3)."""
     return np.abs(colors - others).max(-1)
 

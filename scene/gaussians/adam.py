@@ -103,11 +103,12 @@ class GaussianAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def _step(self, closure: Callable[[], float] | None = None) -> float | None:
+        """Take a step: by the extension for plain parameter groups, by torch for others. Returns the closure's loss."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        groups, others = self._groups()
+        groups, others = self._divide_groups()
         rates, columns, tensors = [], [], []
         for group in groups:
             (param,) = group["params"]
@@ -141,7 +142,7 @@ class GaussianAdam(torch.optim.Adam):
 
     _hooked_step = torch.optim.Optimizer.profile_hook_step(_step)
 
-    def _groups(self) -> tuple[list[Group], list[Group]]:
+    def _divide_groups(self) -> tuple[list[Group], list[Group]]:
         """The groups that the kernel steps, each of one contiguous parameter of the same kind, and those left to torch.
 
         Decided anew in every step, in some microseconds, as anyone may change a group.
@@ -149,18 +150,19 @@ class GaussianAdam(torch.optim.Adam):
         by_kernel, by_torch, kind, options = [], [], None, _common(self.defaults)
         for group in self.param_groups:
             params = group["params"]
-            own = self._kind(params[0]) if len(params) == 1 and _common(group) == options else None
+            own = self._find_kind(params[0]) if len(params) == 1 and _common(group) == options else None
             kind = own if kind is None else kind
             (by_torch if own is None or own != kind else by_kernel).append(group)
         return by_kernel, by_torch
 
-    def _kind(self, param: Tensor) -> tuple[torch.dtype, torch.device] | None:
+    def _find_kind(self, param: Tensor) -> tuple[torch.dtype, torch.device] | None:
         """Dtype and device of a parameter, None for one of a dtype or layout that the kernel does not take."""
         by_kernel = param.dtype == torch.float32 or (param.dtype == torch.float64 and not param.is_cuda)
         fits = by_kernel and param.dim() > 0 and (self._any_strides or param.is_contiguous())
         return (param.dtype, param.device) if fits else None
 
     def _step_by_torch(self, groups: list[Group]) -> None:
+        """Take a step of torch.optim.Adam on some parameter groups only, without calling the hooks again."""
         step = torch.optim.Adam.step
         if getattr(step, "hooked", False):  # once there was an Adam, torch's wrapper, which calls the hooks
             step = step.__wrapped__
@@ -180,13 +182,13 @@ class GaussianAdam(torch.optim.Adam):
 
     def drop_marks(self) -> None:
         """Restart the mean gradient of the values whose step a guard held back."""
-        for group in self._groups()[0]:
+        for group in self._divide_groups()[0]:
             if state := self.state.get(group["params"][0]):
                 state["exp_avg"].nan_to_num_(0.0)
 
     def rewind(self, steps: int) -> None:
         """Reduce the step counters by steps that were counted and not taken."""
-        for group in self._groups()[0]:
+        for group in self._divide_groups()[0]:
             if state := self.state.get(group["params"][0]):
                 state["step"] = (state["step"] - steps).clamp_min(0)
 
@@ -202,7 +204,7 @@ class GaussianAdam(torch.optim.Adam):
 
     def steps_all_by_kernel(self) -> bool:
         """Tell whether the kernel steps every group, and no hook waits for a step."""
-        return not self._has_step_hooks() and not self._groups()[1]
+        return not self._has_step_hooks() and not self._divide_groups()[1]
 
     def state_of(self, param: Tensor) -> dict[str, Tensor]:
         """Step counter and averages of a parameter, zero before its first step, and contiguous."""
@@ -233,7 +235,7 @@ class GaussianAdam(torch.optim.Adam):
         for group, mine, (name, keys) in zip(self.param_groups, own, found, strict=True):
             for param, index, key in zip(group["params"], mine["params"], keys, strict=True):
                 if key in state:
-                    taken[index] = _fitting(state[key], param, name)
+                    taken[index] = _check_state(state[key], param, name)
         undecorated(torch.optim.Adam.load_state_dict)(self, {"state": taken, "param_groups": own})
         return [g.get("name") for g in self.param_groups if any(param not in self.state for param in g["params"])]
 
@@ -253,7 +255,7 @@ class SparseGaussianAdam(GaussianAdam):
 
         Groups that do not have a row per Gaussian are stepped by torch. N: not needed, the reference takes it.
         """
-        groups, others = self._groups()
+        groups, others = self._divide_groups()
         for group in groups:
             (param,) = group["params"]
             if param.grad is None:
@@ -286,7 +288,7 @@ def _has_gradient(groups: list[Group], name: str) -> bool:
     return any(group.get("name") == name and group["params"][0].grad is not None for group in groups)
 
 
-def _fitting(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
+def _check_state(entry: Any, param: Tensor, name: str | None) -> dict[str, Tensor]:
     """Adam's state of one parameter, checked against it."""
     if not isinstance(entry, dict) or not {"step", "exp_avg", "exp_avg_sq"} <= entry.keys():
         raise ValueError(f"step, exp_avg or exp_avg_sq of {name} is missing")

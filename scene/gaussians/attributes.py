@@ -33,13 +33,13 @@ def attributes(sh_degree: int, further: bool = True) -> dict[str, Attribute]:
     bands = (sh_degree + 1) ** 2 - 1
     table = {
         "xyz": Attribute("_xyz", (3,), ["x", "y", "z"], lambda opt, extent: opt.position_lr_init * extent),
-        "f_dc": Attribute("_features_dc", (1, 3), _numbered("f_dc", 3), lambda opt, _: opt.feature_lr),
+        "f_dc": Attribute("_features_dc", (1, 3), _number_names("f_dc", 3), lambda opt, _: opt.feature_lr),
         "f_rest": Attribute(
-            "_features_rest", (bands, 3), _numbered("f_rest", 3 * bands), lambda opt, _: opt.feature_lr / 20.0
+            "_features_rest", (bands, 3), _number_names("f_rest", 3 * bands), lambda opt, _: opt.feature_lr / 20.0
         ),
         "opacity": Attribute("_opacity", (1,), ["opacity"], lambda opt, _: opt.opacity_lr, _INITIAL_LOGIT),
-        "scaling": Attribute("_scaling", (3,), _numbered("scale", 3), lambda opt, _: opt.scaling_lr),
-        "rotation": Attribute("_rotation", (4,), _numbered("rot", 4), lambda opt, _: opt.rotation_lr),
+        "scaling": Attribute("_scaling", (3,), _number_names("scale", 3), lambda opt, _: opt.scaling_lr),
+        "rotation": Attribute("_rotation", (4,), _number_names("rot", 4), lambda opt, _: opt.rotation_lr),
     }
     return table if further else {name: table[name] for name in table if name in IN_CHECKPOINT}
 
@@ -48,5 +48,5 @@ def attributes(sh_degree: int, further: bool = True) -> dict[str, Attribute]:
 IN_CHECKPOINT = ("xyz", "f_dc", "f_rest", "scaling", "rotation", "opacity")
 
 
-def _numbered(name: str, count: int) -> list[str]:
+def _number_names(name: str, count: int) -> list[str]:
     return [f"{name}_{i}" for i in range(count)]

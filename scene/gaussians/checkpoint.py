@@ -39,8 +39,11 @@ class State(NamedTuple):
     spatial_lr_scale: float
     exposures: dict[str, Any] | None  # None: not trained
 
-    def mapped(self, change: Callable[[Tensor], Tensor]) -> "State":
-        """The state with other rows: those of the values, statistics and averages, each of which `change` takes."""
+    def map_rows(self, change: Callable[[Tensor], Tensor]) -> "State":
+        """Return the state with `change` applied to each tensor that has a row for each Gaussian.
+
+        These are the values, the statistics and Adam's averages; `change` may return another number of rows.
+        """
         count = len(self.statistics.denom)
 
         def changed(values: Any) -> Any:
@@ -77,7 +80,7 @@ def capture(gaussians: GaussianParameters) -> tuple:
         float(gaussians.spatial_lr_scale),
         gaussians.exposures.capture() if gaussians.exposures.trained else None,
     )
-    return pack(state.mapped(gaussians.shards.gather_whole))
+    return pack(state.map_rows(gaussians.shards.gather_whole))
 
 
 def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_args: argparse.Namespace) -> None:
@@ -86,7 +89,7 @@ def restore(gaussians: GaussianParameters, model_args: Sequence[Any], training_a
     A model without exposures takes those of the state, too; one that has them must have the same photos.
     UserError when the state was made with another maximal SH degree or does not fit together.
     """
-    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).mapped(gaussians.shards.own_rows)
+    state = unpack(model_args, gaussians._attributes, gaussians.max_sh_degree).map_rows(gaussians.shards.own_rows)
     gaussians.active_sh_degree = state.active_sh_degree
     gaussians.spatial_lr_scale = state.spatial_lr_scale
     gaussians.set_rows(state.rows)
@@ -141,14 +144,14 @@ def with_extra_state(entries: tuple, states: dict[str, Any]) -> tuple:
 
 def extra_state(entries: Sequence[Any]) -> dict[str, Any]:
     """The state that `with_extra_state` has added, and exposures; only exposures in a checkpoint of other code."""
-    optimizer, found = entries[_OPTIMIZER], _exposures_in(entries)
+    optimizer, found = entries[_OPTIMIZER], _find_exposures(entries)
     extra = {} if found is None else {EXPOSURES: found}
     if not isinstance(optimizer, dict) or WRITTEN_BY not in optimizer:
         return extra
     return {key: state for key, state in optimizer.items() if key not in _NO_EXTRA} | extra
 
 
-def _exposures_in(entries: Sequence[Any]) -> dict[str, Any] | None:
+def _find_exposures(entries: Sequence[Any]) -> dict[str, Any] | None:
     """The state of trained exposures; until 0.1.0, it was the last entry."""
     found = next((entry for entry in entries[_ENTRIES:] if isinstance(entry, dict)), None)
     optimizer = entries[_OPTIMIZER]
@@ -176,7 +179,7 @@ def unpack(entries: Sequence[Any], table: dict[str, Attribute], max_sh_degree: i
             "give the --sh_degree it was trained with"
         )
     statistics = Statistics(max_radii2D, xyz_gradient_accum, denom)
-    return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), _exposures_in(entries))
+    return State(int(active_sh_degree), rows, statistics, optimizer, float(spatial_lr_scale), _find_exposures(entries))
 
 
 def check_rows(rows: Rows, table: dict[str, Attribute], max_sh_degree: int) -> None:
@@ -210,10 +213,10 @@ def save_checkpoint(path: str | os.PathLike, capture: tuple, iteration: int) -> 
             # torch hides the cause when its archive writer fails, but the content is never the cause.
             if "inline_container" not in str(error) and "PytorchStreamWriter" not in str(error):
                 raise
-            raise _reason(temporary) from error
+            raise _find_write_error(temporary) from error
 
 
-def _reason(temporary: Path) -> OSError:
+def _find_write_error(temporary: Path) -> OSError:
     """Find the reason why a file cannot be written, by writing more."""
     try:
         with open(temporary, "ab") as file:
@@ -234,14 +237,14 @@ def load_checkpoint(path: str | os.PathLike, mapped: bool = False) -> tuple[tupl
     except ValueError as error:
         raise UserError(f"{path} is not a checkpoint of train.py: {error}; give a chkpntN.pth") from error
     try:
-        return _checked(content)
+        return _check_content(content)
     except ValueError as error:
         raise UserError(
             f"{path} is not a checkpoint of train.py: its parts do not fit together ({error}); give a chkpntN.pth"
         ) from error
 
 
-def _checked(content: Any) -> tuple[tuple, int]:
+def _check_content(content: Any) -> tuple[tuple, int]:
     """Capture and iteration. ValueError says what is wrong; `unpack` checks the shapes of the attributes."""
     if not isinstance(content, tuple | list) or len(content) != 2:
         raise ValueError("it is not a pair of a state and an iteration")
@@ -249,9 +252,9 @@ def _checked(content: Any) -> tuple[tuple, int]:
     if not isinstance(capture, tuple | list) or len(capture) < _ENTRIES:
         raise ValueError(f"the state has fewer than {_ENTRIES} entries")
     if type(iteration) is not int or not 0 <= iteration < 2**31:
-        raise ValueError(f"the iteration is {_in_short(iteration)}")
+        raise ValueError(f"the iteration is {_describe_value(iteration)}")
     if type(capture[0]) is not int or not 0 <= capture[0] <= 3:
-        raise ValueError(f"the active SH degree is {_in_short(capture[0])}")
+        raise ValueError(f"the active SH degree is {_describe_value(capture[0])}")
     per_gaussian = (*capture[1:10], *(entry for entry in capture[_ENTRIES:] if not isinstance(entry, dict)))
     if not all(torch.is_tensor(t) and t.dim() > 0 and t.dtype == torch.float32 for t in per_gaussian):
         raise ValueError("a per-Gaussian value is not a float32 tensor")
@@ -264,11 +267,11 @@ def _checked(content: Any) -> tuple[tuple, int]:
         raise ValueError("the statistics of density control have wrong shapes")
     extent = capture[11]
     if not isinstance(extent, Real) or isinstance(extent, bool) or not 0 <= extent < _LARGEST:
-        raise ValueError(f"the extent of the scene is {_in_short(extent)}")
+        raise ValueError(f"the extent of the scene is {_describe_value(extent)}")
     return tuple(capture), iteration
 
 
-def _in_short(value: Any) -> str:
+def _describe_value(value: Any) -> str:
     """A number, or the type of anything else: what a stranger's file says is never printed."""
     return str(value)[:40] if type(value) in (int, float) else f"a {type(value).__name__}"
 

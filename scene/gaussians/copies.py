@@ -36,11 +36,11 @@ def clusters_of(points: np.ndarray) -> Clusters:
     cell = 2 * NEAR * size or 1e-30
     chosen, places = np.arange(len(points)), np.arange(len(points))
     for shift in (0.0, 0.5):  # a border of cells parts neighbours, but hardly two that are shifted against each other
-        chosen, places = _merged(points, middle, cell, shift, chosen, places)
+        chosen, places = _merge_clusters(points, middle, cell, shift, chosen, places)
     return Clusters(chosen, places, np.bincount(places, minlength=len(chosen)))
 
 
-def _merged(
+def _merge_clusters(
     points: np.ndarray, middle: np.ndarray, cell: float, shift: float, chosen: np.ndarray, places: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Merge the clusters in each cell of a grid."""

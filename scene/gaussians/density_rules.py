@@ -37,7 +37,7 @@ def default_budget(cameras: Sequence[Any]) -> int:
 
 
 def band_rate(cameras: Sequence[Any]) -> float:
-    """Factor of the learning rate of SH bands above degree 0: 1 for FEW_PHOTOS, and in proportion for others.
+    """Compute the factor of the learning rate of SH bands above degree 0: photos / FEW_PHOTOS, at most MOST_BAND_RATE.
 
     Few photos see a Gaussian from few sides, and bands soon fit what is only in them.
     """

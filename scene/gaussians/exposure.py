@@ -162,14 +162,14 @@ def read_exposures(folder: str | os.PathLike, names: Sequence[str], image_names:
     image_names: the same photos' names in the reference's files, which several photos may share.
     """
     path = Path(folder) / NAME
-    table = _read(path)
+    table = _read_table(path)
     exposures = Exposures(names)
     for index, (name, image_name) in enumerate(zip(names, image_names, strict=True)):
         rows = table.get(name, table.get(image_name))
         if rows is None:
             raise UserError(f"{path} has no exposure of {name}; {_REMEDY}")
         with torch.no_grad():
-            exposures.values[index] = _map(rows, name, path)
+            exposures.values[index] = _read_map(rows, name, path)
     return exposures
 
 
@@ -179,10 +179,10 @@ def read_pretrained(folder: str | os.PathLike) -> dict[str, Tensor] | None:
     if not path.exists():
         print(f"no exposures are loaded: there is no {path}")
         return None
-    return {name: _map(rows, name, path).to(compute_device()) for name, rows in _read(path).items()}
+    return {name: _read_map(rows, name, path).to(compute_device()) for name, rows in _read_table(path).items()}
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read_table(path: Path) -> dict[str, Any]:
     """The table of an exposure.json; UserError for a file that has none."""
     try:
         table = json.loads(plain_text(path))
@@ -195,7 +195,7 @@ def _read(path: Path) -> dict[str, Any]:
     return table
 
 
-def _map(rows: Any, name: str, path: Path) -> Tensor:
+def _read_map(rows: Any, name: str, path: Path) -> Tensor:
     """One map (3, 4) of the table, checked."""
     try:
         value = torch.tensor(rows, dtype=torch.float32)

@@ -15,9 +15,11 @@ _PART = 1 << 16  # rows checked at a time, as there may be little memory left
 
 
 def check_finite(rows: Rows, where: str, remedy: str, shards: Shards = WHOLE) -> None:
-    """UserError naming the first attribute with values that are not finite, how many Gaussians, and the first one.
+    """Raise a UserError if a value of an attribute is not finite.
 
-    shards: the place of the rows among those of all processes, which raise the same.
+    The message names the attribute, the number of Gaussians with such values, and the first of these, counted from 0.
+
+    where, remedy: parts of the message. shards: place of the rows among those of all processes, which raise the same.
     """
     for name, values in rows.items():
         finite = torch.cat([part.isfinite().flatten(1).all(dim=1) for part in values.split(_PART)])

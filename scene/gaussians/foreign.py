@@ -33,7 +33,7 @@ def apply_foreign_filter(path: str | os.PathLike, rows: Rows, vertices: np.ndarr
             "--antialiasing"
         )
         widths = torch.from_numpy(np.asarray(vertices[_FILTER], np.float32).reshape(-1, 1).copy())
-        opacity, scaling = _filtered(rows["opacity"], rows["scaling"], widths)
+        opacity, scaling = _apply_filter(rows["opacity"], rows["scaling"], widths)
         rows = rows | {"opacity": opacity, "scaling": scaling}
     note_unread(path, "ply", names)
     elements = {words[1] for line in header_lines(path) if len(words := line.split()) == 3 and words[0] == "element"}
@@ -43,7 +43,7 @@ def apply_foreign_filter(path: str | os.PathLike, rows: Rows, vertices: np.ndarr
     return rows
 
 
-def _filtered(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
+def _apply_filter(logits: Tensor, log_scales: Tensor, widths: Tensor) -> tuple[Tensor, Tensor]:
     """Apply the filter of `widths` (N, 1) of Mip-Splatting (Yu et al. 2024) to logits (N, 1) and log scales (N, 3).
 
     Variances grow by that of the filter, and the opacity falls with the square root of the covariance's determinant.
@@ -71,10 +71,10 @@ def _warn_of_units(path: str | os.PathLike, rows: Rows) -> None:
             found = f"{what} of {path} are from {low:.3g} to {high:.3g}"
             note_once(f"warning: all {found}, so they may be no {form}; {remedy}")
     scales = rows["scaling"]
-    if scales.min() >= 0 and scales.max() > 0 and float(scales.median().exp()) > _LARGE * _extent(rows["xyz"]):
+    if scales.min() >= 0 and scales.max() > 0 and float(scales.median().exp()) > _LARGE * _measure_extent(rows["xyz"]):
         note_once(f"warning: all scales of {path} are above 0, so they may be no logarithms; {remedy}")
 
 
-def _extent(points: Tensor) -> float:
+def _measure_extent(points: Tensor) -> float:
     """The usual distance of points (N, 3) from their middle."""
     return float((points - points.median(dim=0).values).norm(dim=1).median())

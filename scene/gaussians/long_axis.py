@@ -37,25 +37,25 @@ def long_axis_children(xyz: Tensor, scaling: Tensor, rotation: Tensor, opacity: 
     logits (n, 1). First come the children of all parents on one side, then those on the other. What is not returned is
     the parent's. Of axes of the same length the first is split.
     """
-    axis = _longest(scaling)
+    axis = _find_longest(scaling)
     length = exp(scaling.gather(1, axis)) * SHIFT
-    offset = _direction(rotation, axis) * length
+    offset = _compute_direction(rotation, axis) * length
     shorter = scaling.scatter(1, axis, scaling.gather(1, axis) + math.log(SHRINK))
     return {
         "xyz": torch.cat((xyz + offset, xyz - offset)).float(),
         "scaling": shorter.repeat(2, 1),
-        "opacity": _child_logit(opacity).float().repeat(2, 1),
+        "opacity": _compute_child_logit(opacity).float().repeat(2, 1),
     }
 
 
-def _longest(scaling: Tensor) -> Tensor:
+def _find_longest(scaling: Tensor) -> Tensor:
     """Index (n, 1) of the largest of log scales (n, 3), the first of several; argmax may give any of them."""
     x, y, z = scaling.unbind(1)
     first, second = (x >= y) & (x >= z), y >= z
     return torch.where(first, 0, torch.where(second, 1, 2))[:, None]
 
 
-def _direction(rotation: Tensor, axis: Tensor) -> Tensor:
+def _compute_direction(rotation: Tensor, axis: Tensor) -> Tensor:
     """Unit vectors (n, 3) float64 of one axis each, (n, 1), of Gaussians turned by quaternions (n, 4) wxyz."""
     q = rotation.to(torch.float64)
     w, x, y, z = q.unbind(1)
@@ -69,7 +69,7 @@ def _direction(rotation: Tensor, axis: Tensor) -> Tensor:
     return matrices.gather(1, axis[:, :, None].expand(-1, 1, 3))[:, 0]
 
 
-def _child_logit(opacity: Tensor) -> Tensor:
+def _compute_child_logit(opacity: Tensor) -> Tensor:
     """Logits (n, 1) float64 of the children's opacity c of the module's equation, from the parents' logits (n, 1)."""
     parts = 1.0 / (1.0 + exp(-opacity)) * (1.0 / SHRINK)
     root = exp(log(1.0 - parts * (OVERLAP / 2.0)) * 0.5)

@@ -82,6 +82,7 @@ class GaussianParameters:
     denom: Tensor
 
     def __init__(self, sh_degree: int) -> None:
+        """Make a model without Gaussians, on the computing device, for SH coefficients up to a degree."""
         self.active_sh_degree = 0
         self.max_sh_degree = sh_degree
         self.world_offset = (0.0, 0.0, 0.0)
@@ -211,9 +212,9 @@ class GaussianParameters:
 
     def construct_list_of_attributes(self) -> list[str]:
         """Names of the properties of the PLY, in its order."""
-        return column_names(self._degree_of_tensors(), self._scaling.shape[1])
+        return column_names(self._find_degree(), self._scaling.shape[1])
 
-    def _degree_of_tensors(self) -> int:
+    def _find_degree(self) -> int:
         """SH degree of the tensors. It is below max_sh_degree once bands were cut. UserError for a part of a band."""
         bands = self._features_rest.shape[1]
         degree = math.isqrt(bands + 1) - 1
@@ -272,7 +273,7 @@ class GaussianParameters:
     def save_ply(self, path: str | os.PathLike) -> None:
         """Write the raw parameters as a PLY in the reference's layout."""
         comments = frame_comments(self.world_offset, self.enlargement)
-        write_ply(path, raw_rows(self), self._degree_of_tensors(), comments, shards=self.shards)
+        write_ply(path, raw_rows(self), self._find_degree(), comments, shards=self.shards)
 
     @property
     def size_as_ply(self) -> int:

@@ -23,8 +23,11 @@ class Penalty(NamedTuple):
 NO_PENALTY = Penalty()
 
 
-def penalise(gaussians: GaussianParameters, penalty: Penalty) -> None:
-    """Add a penalty's gradients to those of the parameters, with the bits of the step that adds them itself."""
+def add_penalty_gradients(gaussians: GaussianParameters, penalty: Penalty) -> None:
+    """Add the gradients of a penalty to `.grad` of opacities and scales.
+
+    The sums have the same bits as those of a fused step, which adds the penalty itself.
+    """
     if not gaussians.kernels_activate:
         total = gaussians.gaussian_count
         opacity, scale = gaussians.get_opacity.sum() / total, gaussians.get_scaling.sum() / (3 * total)

@@ -44,7 +44,7 @@ def write_ply(
     header += [f"element vertex {shards.total(count)}"]
     names = column_names(sh_degree, rows["scaling"].shape[1], _has_further(rows))
     header += [f"property float {name}" for name in names]
-    pieces = shards.pieces(count, lambda part: _table(rows, sh_degree, part))
+    pieces = shards.pieces(count, lambda part: _make_table(rows, sh_degree, part))
     if not writes_files():
         return deque(pieces, maxlen=0).clear()
     with atomic_write(path) as temporary, open(temporary, "wb") as file:
@@ -54,7 +54,7 @@ def write_ply(
             file.write(piece.cpu().numpy().astype("<f4", copy=False))
 
 
-def _table(rows: Rows, sh_degree: int, part: slice) -> Tensor:
+def _make_table(rows: Rows, sh_degree: int, part: slice) -> Tensor:
     """Some Gaussians (n, columns) as a PLY has them, float32."""
     parts = [rows[name][part] for name in attributes(sh_degree, _has_further(rows))]
     parts.insert(1, torch.zeros_like(parts[0]))
@@ -84,7 +84,7 @@ def frame_comments(world_offset: Sequence[float], enlargement: float) -> list[st
     return kept + ([f"enlargement {enlargement!r}"] if enlargement != 1 else [])
 
 
-def _bands(names: Iterable[str]) -> tuple[int, list[str]]:
+def _find_degree(names: Iterable[str]) -> tuple[int, list[str]]:
     """The least SH degree of so many f_rest, and those of that degree that are missing."""
     rest = {name for name in names if name.startswith("f_rest_")}
     degree = math.ceil((len(rest) / 3 + 1) ** 0.5) - 1
@@ -104,9 +104,9 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
     sh_degree: None: the file's, up to 3. UserError when the file is missing or unreadable, lacks properties (the
     message names them), or has a higher degree.
     """
-    vertices = _as_named(read_vertices(path))
+    vertices = _rename_fields(read_vertices(path))
     present = {name for name in vertices.dtype.names or () if not vertices.dtype[name].hasobject}  # no list
-    degree, lacking = _bands(present)
+    degree, lacking = _find_degree(present)
     sh_degree = min(degree, MOST_BANDS) if sh_degree is None else sh_degree
     table = attributes(min(degree, sh_degree), further)
     parts = {name: attribute.columns for name, attribute in table.items()}
@@ -114,7 +114,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
     if flat and missing == ["scale_2"]:
         parts["scaling"] = parts["scaling"][:2]
     elif missing:
-        raise UserError(_why_no_model(path, missing, present))
+        raise UserError(_explain_no_model(path, missing, present))
     every = 3 * ((degree + 1) ** 2 - 1)
     if lacking:
         found = f"{every - len(lacking)} of {every}, without {lacking[0]}"
@@ -129,7 +129,7 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
         if len(attribute.shape) == 2:  # a file has the bands of one channel after those of another
             bands, channels = attribute.shape
             parts[name] = [parts[name][channel * bands + band] for band in range(bands) for channel in range(channels)]
-    for (name, attribute), values in zip(table.items(), _columns(vertices, list(parts.values())), strict=True):
+    for (name, attribute), values in zip(table.items(), _read_columns(vertices, list(parts.values())), strict=True):
         rows[name] = values.reshape(len(vertices), *attribute.shape) if len(attribute.shape) == 2 else values
     rows["scaling"] = with_scales(rows["scaling"])
     rows = apply_foreign_filter(path, rows, vertices, {name for columns in parts.values() for name in columns})
@@ -139,13 +139,13 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
     return rows
 
 
-def _as_named(vertices: np.ndarray) -> np.ndarray:
+def _rename_fields(vertices: np.ndarray) -> np.ndarray:
     """The vertices without CloudCompare's prefix of names, and without the SH bands above a model's highest degree."""
     names = list(vertices.dtype.names or ())
     if "scalar_f_dc_0" in names:
         vertices = rename_fields(vertices, {name: name.removeprefix("scalar_") for name in names})
         names = list(vertices.dtype.names)
-    degree, lacking = _bands(names)
+    degree, lacking = _find_degree(names)
     if lacking or degree <= MOST_BANDS:
         return vertices  # a caller names what is lacking
     print(
@@ -158,7 +158,8 @@ def _as_named(vertices: np.ndarray) -> np.ndarray:
     return rename_fields(cut, {name: f"f_rest_{index}" for index, name in enumerate(rest)})
 
 
-def _why_no_model(path: str | os.PathLike, missing: Sequence[str], present: Collection[str]) -> str:
+def _explain_no_model(path: str | os.PathLike, missing: Sequence[str], present: Collection[str]) -> str:
+    """Say why a PLY is no Gaussian model, with a remedy. missing, present: names of its properties."""
     if list(missing) == ["scale_2"]:
         return f"{path} has {FLAT}"
     if "packed_position" in present:
@@ -188,7 +189,7 @@ def read_vertices(path: str | os.PathLike) -> np.ndarray:
         ) from error
 
 
-def _columns(vertices: np.ndarray, parts: list[list[str]]) -> Iterator[Tensor]:
+def _read_columns(vertices: np.ndarray, parts: list[list[str]]) -> Iterator[Tensor]:
     """(N, len(part)) float32 for each list of names."""
     kinds = {vertices.dtype[name] for name in vertices.dtype.names}
     if kinds == {np.dtype("<f4")} and vertices.dtype.itemsize == 4 * len(vertices.dtype.names):

@@ -25,11 +25,11 @@ def cut_bounds(f_rest: Tensor, shards: Shards = WHOLE, keep: Tensor | None = Non
     pieces = [f_rest.new_zeros(0, degree, dtype=torch.float64)]
     for start in range(0, len(f_rest), PIECE):
         part = f_rest[start : start + PIECE]
-        pieces.append(_bounds_of_each(part if keep is None else part[keep[start : start + PIECE]], degree))
+        pieces.append(_compute_bounds(part if keep is None else part[keep[start : start + PIECE]], degree))
     return [*(float(shards.largest(most)) for most in torch.cat(pieces).unbind(1)), 0.0]
 
 
-def _bounds_of_each(f_rest: Tensor, degree: int) -> Tensor:
+def _compute_bounds(f_rest: Tensor, degree: int) -> Tensor:
     """The bounds (N, degree) of each Gaussian, by degree from 0 on."""
     total = f_rest.new_zeros(len(f_rest), 3, dtype=torch.float64)
     bounds = []

@@ -34,7 +34,7 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int, enlargemen
             "the point cloud has points that are not finite; remove them, or give another by --init_pcd_path"
         )
     # NumPy's log: one thread, so the same bits for any number of torch's threads.
-    log_scale = torch.from_numpy(np.log(_initial_scales(points, extent, enlargement)))
+    log_scale = torch.from_numpy(np.log(_compute_scales(points, extent, enlargement)))
     colors = torch.from_numpy(np.asarray(cloud.colors, dtype=np.float32))
     rows = {name: torch.full((count, *a.shape), a.start) for name, a in attributes(sh_degree).items()}
     return rows | {
@@ -45,7 +45,7 @@ def start_rows(cloud: BasicPointCloud, extent: float, sh_degree: int, enlargemen
     }
 
 
-def _initial_scales(points: np.ndarray, extent: float, enlargement: float) -> np.ndarray:
+def _compute_scales(points: np.ndarray, extent: float, enlargement: float) -> np.ndarray:
     """Scales (N,) float32, world units: the root mean squared distance to the three nearest neighbours.
 
     Neighbours are sought in other clusters of points if distances within clusters would say nothing.
@@ -54,12 +54,12 @@ def _initial_scales(points: np.ndarray, extent: float, enlargement: float) -> np
         return np.full(len(points), LONE_POINT_SCALE * max(extent, 1e-3 / enlargement), dtype=np.float32)
     places = clusters_of(points)
     if places.hides_spacing:
-        return _initial_scales(points[places.points], extent, enlargement)[places.of_point]
+        return _compute_scales(points[places.points], extent, enlargement)[places.of_point]
     scale = np.sqrt(np.maximum(distCUDA2(torch.from_numpy(points)).numpy(), np.float32(MIN_DISTANCE2 / enlargement**2)))
-    return _without_outliers(scale, extent)
+    return _limit_outliers(scale, extent)
 
 
-def _without_outliers(scale: np.ndarray, extent: float) -> np.ndarray:
+def _limit_outliers(scale: np.ndarray, extent: float) -> np.ndarray:
     """Lower the initial scales (N,) of points far from all others, whose Gaussians would cover every image."""
     stray = scale > OUTLIER_SCALE * extent
     if extent <= 0 or not stray.any():

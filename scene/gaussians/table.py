@@ -26,6 +26,7 @@ class GaussianTable:
     """
 
     def __init__(self, model: Any) -> None:
+        """List the tensors of a model that have a row for each Gaussian: those optimised, their states and others."""
         optimizer = model.optimizer
         self._model = model
         self._storage: Storage | None = getattr(model, "storage", None)
@@ -56,7 +57,7 @@ class GaussianTable:
         groups = [*self.optimised, *(group for group in self.others if bare or group["name"] in rows)]
         counts = [len(group["params"][0]) for group in groups if group.get("name") in rows]
         count = counts[0] if counts else len(self._model)
-        groups = _with_rows(groups, count)
+        groups = _select_groups(groups, count)
         if lacking := [str(group.get("name")) for group in groups if group.get("name") not in rows]:
             raise ValueError(
                 f"no rows are given for {', '.join(lacking)}, which has a row for every Gaussian; "
@@ -77,7 +78,7 @@ class GaussianTable:
     def permute(self, order: Tensor) -> None:
         """Put the rows, with the statistics, into an order (N,) int64: row i becomes what row order[i] was."""
         spills = self._storage is not None
-        self.change(lambda values: _permuted(values, order, spills), self.row_groups())
+        self.change(lambda values: _permute(values, order, spills), self.row_groups())
 
     def change(self, change: Change, groups: Iterable[Group]) -> None:
         """Change the rows of groups and of the statistics, one tensor at a time."""
@@ -128,7 +129,7 @@ class GaussianTable:
 
     def row_groups(self, count: int | None = None) -> list[Group]:
         """The groups that have a row for each of `count` Gaussians, by default those of the model."""
-        return _with_rows([*self.optimised, *self.others], len(self._model) if count is None else count)
+        return _select_groups([*self.optimised, *self.others], len(self._model) if count is None else count)
 
     def _map(self, groups: Iterable[Group], change: Callable[[Tensor, str, bool], Tensor]) -> dict[str, nn.Parameter]:
         """Map parameters and averages; `change` takes values, the group's name, and whether they are averages."""
@@ -161,11 +162,11 @@ class GaussianTable:
         return param
 
 
-def _with_rows(groups: Iterable[Group], count: int) -> list[Group]:
+def _select_groups(groups: Iterable[Group], count: int) -> list[Group]:
     return [g for g in groups if len(g["params"]) == 1 and g["params"][0].dim() and len(g["params"][0]) == count]
 
 
-def _permuted(values: Tensor, order: Tensor, spills: bool) -> Tensor:
+def _permute(values: Tensor, order: Tensor, spills: bool) -> Tensor:
     """Return values[order]; column by column in the memory of `values` itself where there is too little for all.
 
     spills: true if the values may be spilled.

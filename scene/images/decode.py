@@ -37,7 +37,7 @@ def picture_size(path: Path, colors: bool = False) -> tuple[int, int]:
             if not _has_end_mark(path, image.format):
                 image.load()
     except (*UNREADABLE, MemoryError) as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
     return size
 
 
@@ -71,7 +71,7 @@ def decode(path: Path, size: tuple[int, int], opaque: bool = False) -> Tensor:
         with open_image(path) as image:
             return pixels_of(image, size, opaque)
     except UNREADABLE as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
     except MemoryError as error:
         raise UserError(
             f"not enough memory for {path} at {size[0]} x {size[1]} pixels; choose a smaller size with -r"
@@ -90,7 +90,7 @@ def grey_values(path: Path) -> np.ndarray:
             image.info.pop("icc_profile", None)  # its values are no colours
             pixels = pixels_of(image, image.size).numpy()
     except (*UNREADABLE, MemoryError) as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
     return pixels[3] if len(pixels) == 4 else pixels.max(axis=0)
 
 
@@ -110,7 +110,8 @@ def pixels_of(image: Image.Image, size: tuple[int, int], opaque: bool = False) -
     return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1)))
 
 
-def _unreadable(path: Path, error: Exception) -> UserError:
+def _make_read_error(path: Path, error: Exception) -> UserError:
+    """Return the error for an image that cannot be decoded, by the cause that its file or Pillow's error tells."""
     if other := describe_wrong_file(path):
         return UserError(f"{path} is {other}; download it again or take it out of the scene")
     if isinstance(error, Image.DecompressionBombError):
@@ -123,6 +124,7 @@ def _unreadable(path: Path, error: Exception) -> UserError:
 
 
 def _has_end_mark(path: Path, file_format: str | None) -> bool:
+    """Tell whether the mark that ends a PNG or JPEG is in the file's tail; True for other formats."""
     marks = {"PNG": b"IEND", "JPEG": b"\xff\xd9"}
     if file_format not in marks:
         return True
@@ -137,6 +139,7 @@ def _refuse_float(image: Image.Image) -> None:
 
 
 def _to_rgb_or_rgba(image: Image.Image, opaque: bool) -> Image.Image:
+    """Convert an image to sRGB with 8 bits, as RGB or, where it has alpha, RGBA. opaque: without alpha."""
     _refuse_float(image)
     image = to_srgb(image)
     if image.mode.startswith("I"):

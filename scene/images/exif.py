@@ -45,6 +45,7 @@ class Lens(NamedTuple):
         return self.film or self.focal * (self.zoom or 1.0)
 
     def __str__(self) -> str:
+        """Describe the lens in words, for messages."""
         device = self.model if self.model.startswith(self.make) else f"{self.make} {self.model}".strip()
         parts = [device, self.lens]
         if self.focal:
@@ -65,23 +66,23 @@ def read_lens(photo: Path) -> Lens:
     except UNREADABLE:
         return Lens()
     tag = ExifTags.Base
-    zoom = _number(more.get(tag.DigitalZoomRatio))
+    zoom = _round_number(more.get(tag.DigitalZoomRatio))
     return Lens(
-        _text(exif.get(tag.Make)),
-        _text(exif.get(tag.Model)),
-        _text(more.get(tag.LensModel)),
-        _number(more.get(tag.FocalLength)),
-        _number(more.get(tag.FocalLengthIn35mmFilm)),
+        _read_text(exif.get(tag.Make)),
+        _read_text(exif.get(tag.Model)),
+        _read_text(more.get(tag.LensModel)),
+        _round_number(more.get(tag.FocalLength)),
+        _round_number(more.get(tag.FocalLengthIn35mmFilm)),
         0.0 if zoom == 1 else zoom,  # programs write no zoom as 0, as 1, or not at all
     )
 
 
-def _text(value: Any) -> str:
+def _read_text(value: Any) -> str:
     text = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
     return " ".join("".join(c if c.isprintable() else " " for c in text).split()) if isinstance(text, str) else ""
 
 
-def _number(value: Any) -> float:
+def _round_number(value: Any) -> float:
     """Round to a hundredth: a fraction may be written in several ways."""
     try:
         number = float(value)
@@ -104,46 +105,47 @@ def read_place(photo: Path) -> PhotoPlace:
         with open_image(photo) as image:
             exif = image.getexif()
             gps, more = exif.get_ifd(ExifTags.IFD.GPSInfo), exif.get_ifd(ExifTags.IFD.Exif)
-            xmp = _dji(image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b"")
+            xmp = _read_dji(image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b"")
     except UNREADABLE:
         return PhotoPlace()
     note, orientation = more.get(ExifTags.Base.MakerNote), exif.get(ExifTags.Base.Orientation, 1)
-    down = _down(note, orientation) if isinstance(note, bytes) else None
+    down = _compute_down(note, orientation) if isinstance(note, bytes) else None
     if down is None and orientation == 1 and "GimbalPitchDegree" in xmp:
         pitch, roll = (math.radians(xmp.get(f"Gimbal{angle}Degree", 0.0)) for angle in ("Pitch", "Roll"))
         down = np.array([math.sin(roll) * math.cos(pitch), math.cos(roll) * math.cos(pitch), -math.sin(pitch)])
-    return PhotoPlace(_precise(_gps(gps), xmp), down)
+    return PhotoPlace(_refine(_read_gps(gps), xmp), down)
 
 
-def _dji(xmp: bytes | str) -> dict[str, float]:
+def _read_dji(xmp: bytes | str) -> dict[str, float]:
     """The numbers that a drone by DJI writes, by their names there: degrees, and metres; pitch is -90 straight down."""
     text = xmp.decode("utf-8", "replace") if isinstance(xmp, bytes) else xmp
     return {name: float(value) for name, value in _DJI.findall(text)}
 
 
-def _precise(gps: tuple[float, float, float] | None, xmp: Mapping[str, float]) -> tuple[float, float, float] | None:
+def _refine(gps: tuple[float, float, float] | None, xmp: Mapping[str, float]) -> tuple[float, float, float] | None:
     """A place by DJI's numbers, which have more digits than EXIF's, where there are such."""
     latitude, longitude = xmp.get("GpsLatitude"), xmp.get("GpsLongitude", xmp.get("GpsLongtitude"))  # as some spell it
     tags = {ExifTags.GPS.GPSLatitude: latitude, ExifTags.GPS.GPSLongitude: longitude}
     height = xmp.get("AbsoluteAltitude", gps[2] if gps else math.nan)
-    return _gps({**tags, ExifTags.GPS.GPSAltitude: height}) or gps
+    return _read_gps({**tags, ExifTags.GPS.GPSAltitude: height}) or gps
 
 
-def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
+def _read_gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    """Read latitude and longitude (degrees) and height (metres) from GPS tags; None without a plausible place."""
     tag = ExifTags.GPS
     try:
-        latitude = _degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, ""), "NS")
-        longitude = _degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, ""), "EW")
+        latitude = _read_degrees(tags[tag.GPSLatitude], tags.get(tag.GPSLatitudeRef, ""), "NS")
+        longitude = _read_degrees(tags[tag.GPSLongitude], tags.get(tag.GPSLongitudeRef, ""), "EW")
     except (KeyError, TypeError, ValueError):
         return None
     if 180 < longitude <= 360:  # counted to the east alone
         longitude -= 360
-    height, below = _metres(tags.get(tag.GPSAltitude)), _reference(tags.get(tag.GPSAltitudeRef)) in _BELOW
+    height, below = _read_metres(tags.get(tag.GPSAltitude)), _read_reference(tags.get(tag.GPSAltitudeRef)) in _BELOW
     sound = abs(latitude) <= 90 and abs(longitude) <= 180 and (latitude or longitude)
     return (latitude, longitude, -abs(height) if below else height) if sound else None
 
 
-def _metres(value: Any) -> float:
+def _read_metres(value: Any) -> float:
     """A height, NaN if it is missing or damaged."""
     try:
         height = float(value[0] if isinstance(value, tuple) else value)
@@ -152,7 +154,7 @@ def _metres(value: Any) -> float:
     return height if math.isfinite(height) else math.nan
 
 
-def _degrees(parts: Any, reference: Any, letters: str) -> float:
+def _read_degrees(parts: Any, reference: Any, letters: str) -> float:
     """Degrees of one to three parts: degrees, minutes, seconds. ValueError if they are damaged.
 
     letters: what the reference begins with where they are positive, and negative. Without one, the sign counts; another
@@ -164,26 +166,26 @@ def _degrees(parts: Any, reference: Any, letters: str) -> float:
     if not 1 <= len(values) <= 3 or not all(map(math.isfinite, values)):
         raise ValueError(f"{parts} are no degrees")
     angle = sum(abs(value) / 60**place for place, value in enumerate(values))
-    letter = _reference(reference)[:1]
+    letter = _read_reference(reference)[:1]
     if letter.isalpha() and letter not in letters:
         raise ValueError(f"{reference} is no direction")
     negative = letter == letters[1] if letter and letter in letters else min(values) < 0
     return -angle if negative else angle
 
 
-def _reference(value: Any) -> str:
+def _read_reference(value: Any) -> str:
     """A reference, which some programs write as bytes, as a number, or with blanks, as text."""
     text = value.decode("latin-1") if isinstance(value, bytes) else str(value)
     return text.strip("\0\t\r\n ").upper()
 
 
-def _down(note: bytes, orientation: Any) -> np.ndarray | None:
+def _compute_down(note: bytes, orientation: Any) -> np.ndarray | None:
     """Down by an Apple note: acceleration in the device's axes, x right, y to its top, z out of its screen.
 
     A phone that lies on its back has (0, 0, -1). Its rear camera's stored pixels have their right at the device's
     bottom, and their lower side at its left.
     """
-    vector = _acceleration(note)
+    vector = _read_acceleration(note)
     if vector is None or orientation not in _UPRIGHT:
         return None
     length = float(np.linalg.norm(vector))
@@ -195,12 +197,12 @@ def _down(note: bytes, orientation: Any) -> np.ndarray | None:
     return np.array([a * right + b * low, c * right + d * low, -z])
 
 
-def _acceleration(note: bytes) -> np.ndarray | None:
+def _read_acceleration(note: bytes) -> np.ndarray | None:
     """The vector (3,) of an Apple note, a big-endian directory whose offsets count from its first byte."""
     if not note.startswith(_APPLE) or note[12:14] != b"MM":
         return None
     try:
-        for entry in range(*_entries(note)):
+        for entry in range(*_list_entries(note)):
             tag, kind, count, offset = struct.unpack_from(">HHII", note, entry)
             if (tag, kind, count) == (_ACCELERATION, _SIGNED_RATIONAL, 3):
                 values = np.array(struct.unpack_from(">6i", note, offset), np.float64).reshape(3, 2)
@@ -210,6 +212,6 @@ def _acceleration(note: bytes) -> np.ndarray | None:
     return None
 
 
-def _entries(note: bytes) -> tuple[int, int, int]:
+def _list_entries(note: bytes) -> tuple[int, int, int]:
     (count,) = struct.unpack_from(">H", note, 14)
     return 16, 16 + 12 * count, 12

@@ -17,23 +17,23 @@ def exposures(colors: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.
     colors, points: of each photo the colours (K,3), sRGB in [0, 1], of the points with these numbers (K,).
     """
     usable = [(values.max(1, initial=0) < _LIGHT) & (values.min(1, initial=1) > _DARK) for values in colors]
-    logs = [np.log2(_linear(values[some]) @ _LUMINANCE) for values, some in zip(colors, usable, strict=True)]
-    return _levels(logs, [numbers[some] for numbers, some in zip(points, usable, strict=True)])
+    logs = [np.log2(_to_linear(values[some]) @ _LUMINANCE) for values, some in zip(colors, usable, strict=True)]
+    return _fit_levels(logs, [numbers[some] for numbers, some in zip(points, usable, strict=True)])
 
 
-def _levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.ndarray:
+def _fit_levels(values: Sequence[np.ndarray], points: Sequence[np.ndarray]) -> np.ndarray:
     """Fit values (K,) of each photo's points robustly by photo plus point; return the photos' terms (N,), of mean 0."""
     value, photo = np.concatenate(values), np.repeat(np.arange(len(values)), [len(one) for one in values])
     point = np.unique(np.concatenate(points), return_inverse=True)[1]
     weight = np.ones(len(value))
     for _ in range(_ROUNDS):
-        level, own = _fitted(value, weight, photo, point, len(values))
+        level, own = _fit_terms(value, weight, photo, point, len(values))
         away = value - level[photo] - own[point]
         weight = np.maximum(1 - (away / _OUTLIER) ** 2, 1e-3) ** 2
     return level - level.mean()
 
 
-def _fitted(
+def _fit_terms(
     values: np.ndarray, weight: np.ndarray, photo: np.ndarray, point: np.ndarray, photos: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Fit values (K,) by a term for each photo (photos,) and each point, by weighted least squares.
@@ -53,6 +53,6 @@ def _fitted(
     return level, np.bincount(point, weight * (values - level[photo])) / of_point
 
 
-def _linear(values: np.ndarray) -> np.ndarray:
+def _to_linear(values: np.ndarray) -> np.ndarray:
     """Convert sRGB to linear light (IEC 61966-2-1)."""
     return np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)

@@ -30,18 +30,18 @@ class FileIndex:
         self.merely_alike: dict[str, Path] = {}
         self._folder = folder
 
-    def find(self, *names: str, but: Callable[[Path], bool] = lambda path: False) -> Path | None:
-        """The file of the first name that has one; None if none has, or if several files match but none exactly.
+    def find(self, *names: str, skip: Callable[[Path], bool] = lambda path: False) -> Path | None:
+        """Find the file of the first name that has one; None if none has, or if several files match but none exactly.
 
-        but: whether a file is passed over.
+        skip: returns True for a file that must not be found.
         """
         for name in names:
             # Path.is_file raises an error for a name that is too long for the system; here it counts as missing.
-            if os.path.isfile(exact := self._folder / name) and not but(exact):
+            if os.path.isfile(exact := self._folder / name) and not skip(exact):
                 return exact
         for name in names:
-            alike = self._folded.get(_folded(name), [])
-            if len(alike) == 1 and not but(alike[0]):
+            alike = self._folded.get(_fold_name(name), [])
+            if len(alike) == 1 and not skip(alike[0]):
                 self.merely_alike[name] = alike[0]
                 return alike[0]
         return None
@@ -51,7 +51,7 @@ class FileIndex:
         """Files by folded name, made at the first miss: a large folder takes time."""
         found: dict[str, list[Path]] = {}
         for path in files_below(self._folder):
-            found.setdefault(_folded(str(path.relative_to(self._folder))), []).append(path)
+            found.setdefault(_fold_name(str(path.relative_to(self._folder))), []).append(path)
         return found
 
     @cached_property
@@ -63,11 +63,11 @@ class FileIndex:
 
     def named(self, name: str) -> list[Path]:
         """All files of a bare name, in any sub-folder."""
-        return self._bare.get(_folded(name), [])
+        return self._bare.get(_fold_name(name), [])
 
     def with_another_suffix(self, name: str) -> list[Path]:
         """Images of this name with another suffix, likely the same photo in another format."""
-        stem = os.path.splitext(_folded(name))[0]
+        stem = os.path.splitext(_fold_name(name))[0]
         return [path for suffix in SUFFIXES for path in self._folded.get(stem + suffix, [])]
 
     def description(self) -> str:
@@ -85,12 +85,12 @@ def files_below(folder: Path) -> Iterator[Path]:
         yield from (Path(here, file) for file in files if os.path.isfile(os.path.join(here, file)))
 
 
-def _folded(name: str) -> str:
+def _fold_name(name: str) -> str:
     name = unicodedata.normalize("NFC", os.path.normpath(name.replace("\\", "/"))).casefold()
     return name.replace(os.sep, "/")
 
 
-def _broken(paths: Sequence[Path | None]) -> str:
+def _describe_broken(paths: Sequence[Path | None]) -> str:
     """Words on the files that are there and cannot be read, so that one message tells of all; empty without any."""
     broken = []
     for path in paths:
@@ -121,7 +121,7 @@ def find_images(
             instead = " (a broken link, or not a file)"
         raise UserError(
             f"{len(missing)} of {len(paths)} {kind} that {listed_by} lists are missing: "
-            f"{some([str(folder / name) for name in missing])}{instead}{_broken(paths)}; {remedy}"
+            f"{some([str(folder / name) for name in missing])}{instead}{_describe_broken(paths)}; {remedy}"
         )
     for changed, difference in ((others, "have another suffix than"), (index.merely_alike, "differ slightly from")):
         if changed:
@@ -139,7 +139,7 @@ def find_listed(
 ) -> tuple[list[Path | None], dict[str, Path]]:
     """The files of photos as `find_images` finds them, None without one; and those with another suffix, by name."""
     paths = [index.find(name, *(name + suffix for suffix in suffixes)) for name in names]
-    others = _in_another_format(index, names, paths)
+    others = _find_converted(index, names, paths)
     return [others.get(name, path) for name, path in zip(names, paths, strict=True)], others
 
 
@@ -174,17 +174,21 @@ def find_in(folder: Path, names: Sequence[str], suffixes: Sequence[str]) -> list
     return [files.find(place, lambda name: (name, *(name + one for one in suffixes))) for place in range(len(names))]
 
 
-def _in_another_format(index: FileIndex, names: Sequence[str], paths: Sequence[Path | None]) -> dict[str, Path]:
-    """Files of missing photos that were converted, by name: one of the same name but for its suffix, of no other."""
+def _find_converted(index: FileIndex, names: Sequence[str], paths: Sequence[Path | None]) -> dict[str, Path]:
+    """Find the files of missing photos that were converted to another format, by the photos' names.
+
+    paths: the files that were found for `names`, None: missing. A file counts if only its suffix differs from the name,
+    it is the only such file, and no other photo has it.
+    """
     missing = {name for name, path in zip(names, paths, strict=True) if path is None}
     if not missing:
         return {}
     found = {name: index.with_another_suffix(name) for name in missing}
     taken = Counter(path for alike in [*found.values(), filter(None, paths)] for path in alike)
-    return {name: found[name][0] for name in names if name in missing and _only(found[name], taken)}
+    return {name: found[name][0] for name in names if name in missing and _is_only(found[name], taken)}
 
 
-def _only(alike: Sequence[Path], taken: Mapping[Path, int]) -> bool:
+def _is_only(alike: Sequence[Path], taken: Mapping[Path, int]) -> bool:
     return len(alike) == 1 and taken[alike[0]] == 1
 
 
@@ -205,8 +209,8 @@ def names_below(names: Sequence[str], base: Path) -> list[str]:
 def endings_of(names: Sequence[str]) -> list[list[str]]:
     """For each name its trailing parts, the longest first, of which no other name has the same up to the suffix."""
     parts = {name: ["/".join(name.split("/")[start:]) for start in range(name.count("/") + 1)] for name in names}
-    counts = Counter(_stem(part) for own in parts.values() for part in own)
-    return [[part for part in parts[name] if part == name or counts[_stem(part)] == 1] for name in names]
+    counts = Counter(_fold_stem(part) for own in parts.values() for part in own)
+    return [[part for part in parts[name] if part == name or counts[_fold_stem(part)] == 1] for name in names]
 
 
 class SideFiles:
@@ -219,7 +223,7 @@ class SideFiles:
     """
 
     def __init__(self, folder: Path, names: Sequence[str], photos: Sequence[str | Path], base: Path) -> None:
-        """names, photos: of all photos, which must differ; their files may be missing. base: as for `names_below`."""
+        """names, photos: of all photos, which must differ; the files may be missing. base: folder of relative names."""
         self.elsewhere: dict[str, Path] = {}
         self.photos_met: set[Path] = set()
         self.names = names_below(names, base)
@@ -231,7 +235,7 @@ class SideFiles:
         """The file of a photo, by its place in the list; None without one. spelled: file names for a photo's name."""
         endings = self._endings[place]
         for ending in endings:
-            if found := self._index.find(*spelled(ending), but=lambda path: self._is_photo(path, place)):
+            if found := self._index.find(*spelled(ending), skip=lambda path: self._is_photo(path, place)):
                 return found
         bare = endings[-1]
         if "/" in bare:
@@ -252,6 +256,7 @@ class SideFiles:
             print(f"{said}; the first is {path} for {name}", file=sys.stderr)
 
     def _is_photo(self, path: Path, place: int) -> bool:
+        """Tell whether a file is a photo of the dataset, or a copy of the photo at `place` of the list."""
         own = self._photos[place]
         found = identity(path) in self._identities or (os.path.isfile(own) and filecmp.cmp(own, path, shallow=False))
         if found:
@@ -263,7 +268,7 @@ def _leads_out(name: str) -> bool:
     return os.path.isabs(name) or name.split("/")[0] == os.pardir
 
 
-def _stem(name: str) -> str:
+def _fold_stem(name: str) -> str:
     return os.path.splitext(name)[0].casefold()
 
 

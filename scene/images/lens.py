@@ -77,19 +77,19 @@ def pinhole_of(lens: Lens, name: str) -> Pinhole | None:
     """
     narrow, wide = sorted((lens.width, lens.height))
     if not (np.isfinite(lens.params).all() and narrow > 0 and wide <= _LARGEST):
-        raise _unusable(lens, name)
+        raise _make_lens_error(lens, name)
     if lens.model == PANORAMA:
         if lens.params != (lens.width, lens.height):
-            raise _unusable(lens, name)
+            raise _make_lens_error(lens, name)
         return None
     if lens.model in MODELS:  # without pycolmap, which is slow to import
         chart, focals, places = MODELS[lens.model]
         if len(lens.params) != focals + 2 + len(places):
-            raise _unusable(lens, name)
+            raise _make_lens_error(lens, name)
         focal, center, further = lens.params[:focals], lens.params[focals : focals + 2], lens.params[focals + 2 :]
         straight = chart == "perspective" and max(map(abs, further), default=0.0) < _STRAIGHT
     else:
-        camera = _camera(lens, name)
+        camera = _make_camera(lens, name)
         focal = tuple(lens.params[index] for index in camera.focal_length_idxs())
         center = tuple(lens.params[index] for index in camera.principal_point_idxs())
         # is_undistorted alone is also true of a fisheye without further parameters.
@@ -114,16 +114,16 @@ def rays_of(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     if lens.model in ("SIMPLE_PINHOLE", "PINHOLE"):  # without pycolmap
         focal, center = np.array(lens.params[:-2]), np.array(lens.params[-2:])
         return (pixels - center) / focal
-    camera, pixels = _camera(lens), np.ascontiguousarray(pixels)
+    camera, pixels = _make_camera(lens), np.ascontiguousarray(pixels)
     rays = np.asarray(camera.cam_from_img(pixels), dtype=np.float64).reshape(-1, 2)
-    return np.where(_round_trip(camera, pixels)[:, None] < _ROUND_TRIP, rays, np.nan)
+    return np.where(_measure_round_trip(camera, pixels)[:, None] < _ROUND_TRIP, rays, np.nan)
 
 
 def _check_bounds(lens: Lens, focal: Sequence[float], center: Sequence[float], name: str) -> None:
     size = max(lens.width, lens.height)
     astray = max(abs(center[0] / lens.width - 0.5), abs(center[1] / lens.height - 0.5))
     if not (_SHORTEST * size <= min(focal) <= max(focal) <= _LONGEST * size and astray <= _FARTHEST):
-        raise _unusable(lens, name)
+        raise _make_lens_error(lens, name)
 
 
 @functools.lru_cache(maxsize=4096)
@@ -138,9 +138,10 @@ def _is_plausible(lens: Lens, focal: float) -> bool:
     if lens.model not in MODELS:
         around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
         circle = inner / 2 * np.column_stack([np.cos(around), np.sin(around)])  # wider, a fisheye has rays behind it
-        camera = _camera(lens)
+        camera = _make_camera(lens)
         return bool(
-            _round_trip(camera, circle + (camera.principal_point_x, camera.principal_point_y)).max() < _ROUND_TRIP
+            _measure_round_trip(camera, circle + (camera.principal_point_x, camera.principal_point_y)).max()
+            < _ROUND_TRIP
         )
     native = native_of(lens.model, lens.params)
     fisheye = native.chart == "equidistant"
@@ -156,18 +157,19 @@ def _is_plausible(lens: Lens, focal: float) -> bool:
     return bool(r[reached.argmax()] * focal * _STRETCH > inner)
 
 
-def _unusable(lens: Lens, name: str) -> UserError:
+def _make_lens_error(lens: Lens, name: str) -> UserError:
     return UserError(
         f"the camera of {name} has no usable size or focal length, or a principal point far outside of the photo "
         f"({lens.model}, {lens.width} x {lens.height}, {lens.params}); fix it, or export the cameras again"
     )
 
 
-def _camera(lens: Lens, name: str = "") -> Any:
+def _make_camera(lens: Lens, name: str = "") -> Any:
+    """Make the pycolmap camera of a lens. UserError for parameters that do not fit; name: of the photo, for it."""
     pycolmap = import_pycolmap()
     camera = pycolmap.Camera(model=lens.model, width=lens.width, height=lens.height, params=list(lens.params))
     if not camera.verify_params():
-        raise _unusable(lens, name)
+        raise _make_lens_error(lens, name)
     return camera
 
 
@@ -175,7 +177,7 @@ def _camera(lens: Lens, name: str = "") -> Any:
 def undistortion(lens: Lens, width: int, height: int) -> Undistortion:
     """Undistortion for photos of a lens that are width x height pixels large; the lens is scaled to that size."""
     pycolmap = import_pycolmap()
-    camera = _camera(lens)
+    camera = _make_camera(lens)
     if (lens.width, lens.height) != (width, height):
         camera.rescale(width, height)
     options = pycolmap.UndistortCameraOptions()
@@ -197,17 +199,17 @@ def visible_pixels(lens: Lens, width: int, height: int) -> np.ndarray:
     white = pycolmap.Bitmap.from_array(np.full((height, width), 255, np.uint8))
     visible, result = pycolmap.undistort_image(plan.options, white, plan.camera)
     visible = visible.to_array() == 255
-    return visible if plan.widest is None else visible & _visible_once(plan.camera, result)
+    return visible if plan.widest is None else visible & _find_visible(plan.camera, result)
 
 
 def _border_can_be_projected(camera: Any) -> bool:
     along = np.linspace(0, 1, 65)
     sides = [np.column_stack([along, np.full(65, end)]) for end in (0, 1)]
     border = np.concatenate([*sides, *(side[:, ::-1] for side in sides)]) * (camera.width, camera.height)
-    return bool(_round_trip(camera, border).max() < _ROUND_TRIP)
+    return bool(_measure_round_trip(camera, border).max() < _ROUND_TRIP)
 
 
-def _round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
+def _measure_round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
     """Error (N,) in pixels of points (N,2) after projection to their rays and back; infinite without a ray."""
     with np.errstate(all="ignore"):
         rays = np.column_stack([camera.cam_from_img(pixels), np.ones(len(pixels))])
@@ -215,7 +217,7 @@ def _round_trip(camera: Any, pixels: np.ndarray) -> np.ndarray:
     return np.nan_to_num(distance, nan=np.inf)
 
 
-def _visible_once(camera: Any, pinhole: Any) -> np.ndarray:
+def _find_visible(camera: Any, pinhole: Any) -> np.ndarray:
     """Pixels of the pinhole whose rays the photo really shows: (height, width) bool.
 
     Far from the centre a distortion polynomial turns back, and would show parts of the photo a second time.

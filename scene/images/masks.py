@@ -84,11 +84,11 @@ class Mask:
         """(1,H,W) uint8 at size (width, height): 255 keeps, 0 masks.
 
         The values are the file's alpha if it has any, else its brightness. Which of them is white, the file's own
-        values tell (`_in_full_range`). For IGNORE, half of white keeps and the result is 0 or 255. When the size
+        values tell (`_stretch_range`). For IGNORE, half of white keeps and the result is 0 or 255. When the size
         differs from the file's, IGNORE keeps only pixels to which no masked pixel contributes when resized by
         `scene.images.decode.decode`.
         """
-        grey = self._grey()
+        grey = self._read_grey()
         if self.meaning == TRANSPARENT:
             image = Image.fromarray(np.ascontiguousarray(grey))
             image = image if image.size == size else image.resize(size, Image.Resampling.BICUBIC)
@@ -100,10 +100,10 @@ class Mask:
             kept = kept.resize(size, Image.Resampling.BOX).filter(_SPREAD)
         return torch.from_numpy(np.where(np.asarray(kept) == 255, np.uint8(255), np.uint8(0)))[None]
 
-    def _grey(self) -> np.ndarray:
+    def _read_grey(self) -> np.ndarray:
         """The values (H, W) uint8 of the file, of which 255 keeps."""
         if self.drawn:
-            grey = _in_full_range(grey_values(self.path), lossy=self.path.suffix.lower() in (".jpg", ".jpeg"))
+            grey = _stretch_range(grey_values(self.path), lossy=self.path.suffix.lower() in (".jpg", ".jpeg"))
             grey = 255 - grey if self.inverted else grey
         else:
             grey = np.full(picture_size(self.path)[::-1], 255, np.uint8)
@@ -149,7 +149,7 @@ def add_alpha(pixels: Tensor, mask: Tensor) -> Tensor:
     return torch.cat([pixels[:3], mask])
 
 
-def _in_full_range(values: np.ndarray, lossy: bool) -> np.ndarray:
+def _stretch_range(values: np.ndarray, lossy: bool) -> np.ndarray:
     """A mask's values (H, W), uint8 or uint16, as uint8 in which white is 255.
 
     Files below half of their range are dark masks, or no grey at all. With few different values these are booleans or

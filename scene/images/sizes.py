@@ -32,7 +32,7 @@ def training_size(width: int, height: int, resolution: int, scale: float = 1.0) 
         if resolution != -1:
             factor = width / resolution
         elif width > WIDEST:
-            _notice()
+            _print_notice()
             factor = width / WIDEST
         else:
             factor = 1.0
@@ -46,7 +46,7 @@ def training_size(width: int, height: int, resolution: int, scale: float = 1.0) 
 
 
 @functools.cache
-def _notice() -> None:
+def _print_notice() -> None:
     # Cached: printed once per process, not once per photo.
     print(f"photos wider than {WIDEST} pixels are shrunk to that width; -r 1 keeps their size", file=sys.stderr)
 
@@ -60,42 +60,44 @@ def shrink_photo(pixels: Tensor, size: tuple[int, int], mask_alpha: bool = False
     if pixels.is_floating_point():
         return shrink_values(pixels, size)
     if len(pixels) == 4 and mask_alpha:
-        return torch.cat([_rounded(_sums(pixels[:3], size), _area(pixels)), shrink_mask(pixels[3:], size)])
+        return torch.cat(
+            [_divide_rounded(_sum_areas(pixels[:3], size), _count_pixels(pixels)), shrink_mask(pixels[3:], size)]
+        )
     if len(pixels) == 4:
         alpha = pixels[3:].int()
-        weights = _sums(alpha, size)
-        colors = _rounded(_sums(pixels[:3].int() * alpha, size), weights.clamp_min(1))
-        return torch.cat([colors, _rounded(weights, _area(pixels))])
-    return _rounded(_sums(pixels, size), _area(pixels))
+        weights = _sum_areas(alpha, size)
+        colors = _divide_rounded(_sum_areas(pixels[:3].int() * alpha, size), weights.clamp_min(1))
+        return torch.cat([colors, _divide_rounded(weights, _count_pixels(pixels))])
+    return _divide_rounded(_sum_areas(pixels, size), _count_pixels(pixels))
 
 
 def shrink_mask(mask: Tensor, size: tuple[int, int]) -> Tensor:
     """A mask (1,H,W) uint8 at a smaller size: 255 where all that a pixel covers is 255, else 0."""
-    return torch.where(_sums(mask, size) == FULL * _area(mask), FULL, 0).to(torch.uint8)
+    return torch.where(_sum_areas(mask, size) == FULL * _count_pixels(mask), FULL, 0).to(torch.uint8)
 
 
 def shrink_values(values: Tensor, size: tuple[int, int]) -> Tensor:
     """Values (C,H,W) float32 at a smaller size, as the depth map of a view."""
-    return (_sums(values.double(), size) / _area(values)).to(values.dtype)
+    return (_sum_areas(values.double(), size) / _count_pixels(values)).to(values.dtype)
 
 
-def _area(pixels: Tensor) -> int:
+def _count_pixels(pixels: Tensor) -> int:
     return pixels.shape[-2] * pixels.shape[-1]
 
 
-def _rounded(sums: Tensor, parts: Tensor | int) -> Tensor:
+def _divide_rounded(sums: Tensor, parts: Tensor | int) -> Tensor:
     return torch.div(sums + parts // 2, parts, rounding_mode="floor").to(torch.uint8)
 
 
-def _sums(pixels: Tensor, size: tuple[int, int]) -> Tensor:
+def _sum_areas(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     """Sums (C,h,w) over what each pixel covers, times the number of pixels of the picture."""
     whole = not pixels.is_floating_point()
     # Rows of 16384 products of two bytes fit into 32 bits; their sums do not.
-    rows = _along(pixels.int() if whole else pixels, 1, size[1])
-    return _along(rows.long() if whole else rows, 2, size[0])
+    rows = _sum_along(pixels.int() if whole else pixels, 1, size[1])
+    return _sum_along(rows.long() if whole else rows, 2, size[0])
 
 
-def _along(pixels: Tensor, axis: int, new: int) -> Tensor:
+def _sum_along(pixels: Tensor, axis: int, new: int) -> Tensor:
     """Sums along an axis of n pixels to `new` ones, with weights that add up to n."""
     old = pixels.shape[axis]
     # In units of 1 / new pixels, an old pixel is `new` long, and a new one `old`.

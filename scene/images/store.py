@@ -82,6 +82,7 @@ class ImageStore:
         device: torch.device | str | None = None,
         ranks: Ranks = ALONE,
     ) -> None:
+        """Make an empty store. The arguments are those of the class."""
         self.limit = limit
         self.ranks = ranks
         self.keep_on = torch.device(keep_on)
@@ -101,12 +102,12 @@ class ImageStore:
         If the images kept at once exceed GPU_SHARE of a GPU's free memory, the CPU keeps them. A limit that all images
         fit into is dropped.
         """
-        training = dict.fromkeys(_key(source, size) for source, size in training)
-        keys = dict.fromkeys([*training, *(_key(source, size) for source, size in others)])
+        training = dict.fromkeys(_make_key(source, size) for source, size in training)
+        keys = dict.fromkeys([*training, *(_make_key(source, size) for source, size in others)])
         self._planned = set(keys)
         if self.ranks.several:
-            sizes = {key: _bytes(*key) for key in keys}
-            self._planned, self._shared = share_images(sizes, self._own, self.device, self.ranks)
+            sizes = {key: _count_bytes(*key) for key in keys}
+            self._planned, self._shared = share_images(sizes, self._get_own, self.device, self.ranks)
         self._awaited = self._planned & training.keys()
         if self.limit >= len(self._planned):
             self.limit = 0
@@ -126,7 +127,7 @@ class ImageStore:
     @property
     def planned_bytes(self) -> int:
         """Upper bound on the bytes of the images of `plan` that this process keeps at once."""
-        sizes = sorted((_bytes(*key) for key in self._planned), reverse=True)
+        sizes = sorted((_count_bytes(*key) for key in self._planned), reverse=True)
         if self._copies:
             sizes = [1 << (size - 1).bit_length() for size in sizes]  # torch pins memory in powers of two
         return sum(sizes[: self.limit or None])
@@ -141,18 +142,19 @@ class ImageStore:
 
         UserError as `decode`.
         """
-        key = _key(source, size)
-        return self._shared[key].pixels if key in self._shared else self._own(key)
+        key = _make_key(source, size)
+        return self._shared[key].pixels if key in self._shared else self._get_own(key)
 
     def transformed(self, source: Source, size: Size, change: Callable[[Tensor], Tensor]) -> InMemory:
         """Make an image of another one, which the store does not keep: now, or in one process for all that share it."""
-        shared = self._shared.get(_key(source, size))
+        shared = self._shared.get(_make_key(source, size))
         return InMemory(change(self.get(source, size))) if shared is None else shared.transformed(change)
 
-    def _own(self, key: Key) -> Tensor:
+    def _get_own(self, key: Key) -> Tensor:
+        """Return this process's own image of a key on the device, decoded now if it is not kept."""
         picture = self._kept.get(key)
         if picture is None or isinstance(picture, Future):
-            picture = self._finished(key)
+            picture = self._finish(key)
         self._kept.move_to_end(key)
         return self._copies.take(key, picture) if self._copies else picture.to(self.device, non_blocking=True)
 
@@ -173,7 +175,7 @@ class ImageStore:
 
         An image that cannot be decoded raises its error in `get`.
         """
-        keys = dict.fromkeys(_key(source, size) for source, size in coming)
+        keys = dict.fromkeys(_make_key(source, size) for source, size in coming)
         keys = [key for key in keys if key not in self._shared or key in self._planned][: self.limit or None]
         for key in keys:
             if key in self._kept:
@@ -191,13 +193,13 @@ class ImageStore:
                 if not isinstance(picture, Future):
                     self._copies.send(key, picture)
                 elif picture.done() and not picture.exception():
-                    self._copies.send(key, self._finished(key))
+                    self._copies.send(key, self._finish(key))
 
     def __len__(self) -> int:
         """Number of images that are kept, those being decoded included."""
         return len(self._kept)
 
-    def _finished(self, key: Key) -> Tensor:
+    def _finish(self, key: Key) -> Tensor:
         """Wait for the thread that decodes an image, or decode it here if none does; keep it on `keep_on`."""
         future = self._kept.pop(key, None)
         if future is None:
@@ -256,11 +258,11 @@ class DeviceCopies:
             del self._sent[key]
 
 
-def _key(source: Source, size: Size) -> Key:
+def _make_key(source: Source, size: Size) -> Key:
     return os.fspath(source) if isinstance(source, Path) else source, size
 
 
-def _bytes(source: str | Decodable, size: Size) -> int:
+def _count_bytes(source: str | Decodable, size: Size) -> int:
     """Most bytes of a decoded image: a JPEG has no alpha; other files may have some, which only decoding shows."""
     if not isinstance(source, str):
         return source.pixel_bytes * size[0] * size[1]

@@ -51,7 +51,7 @@ def read_colmap(
     Arguments and errors as for `scene.dataset_readers.read_scene`; start None: without points.
     """
     model_folder, model = find_model(folder, with_points=start is not None)
-    note_unread(model_folder, "colmap", _side_files(model_folder))
+    note_unread(model_folder, "colmap", _list_side_files(model_folder))
     if (listed := model_folder / "test.txt").is_file():  # of the reference, whose train.py does not read it either
         refuse_rule(rule, listed)
     if not model.images:
@@ -79,35 +79,38 @@ def read_colmap(
         for photo, path, mask in zip(photos, paths, found, strict=True)
     ]
     views = split(to_pinholes(cameras, masks.drop_alpha), hold_out, rule, folder)
-    own, lacking = partial(_own_cloud, folder, model_folder, model), f"{listed_by} has no points"
+    own, lacking = partial(_read_own_cloud, folder, model_folder, model), f"{listed_by} has no points"
     return scene_info(views, start, own, partial(random_in_frusta, views[0]), lacking)
 
 
 def colmap_camera(
     photo: Image, camera: Camera, path: Path, mask: Mask | None = None, ignore_alpha: bool = False, native: bool = False
 ) -> CameraInfo:
-    """The view of a photo that COLMAP registered. native: as for `camera_info`."""
-    return camera_info(camera.id, photo.name, path, _lens(camera), *_pose(photo), mask, ignore_alpha, native)
+    """Make the view of a photo that COLMAP registered. native: keep a lens that the rasterizer draws."""
+    return camera_info(camera.id, photo.name, path, _make_lens(camera), *_read_pose(photo), mask, ignore_alpha, native)
 
 
 def read_poses(folder: Path) -> list[Posed]:
     """The poses and lenses of a model's photos, whose points may be missing. UserError where it cannot be read."""
     model = read_model(folder)
-    lenses = {number: _lens(camera) for number, camera in model.cameras.items()}
-    return [Posed(photo.name, *_pose(photo), lambda _, lens=lenses[photo.camera_id]: lens) for photo in model.images]
+    lenses = {number: _make_lens(camera) for number, camera in model.cameras.items()}
+    return [
+        Posed(photo.name, *_read_pose(photo), lambda _, lens=lenses[photo.camera_id]: lens) for photo in model.images
+    ]
 
 
-def _lens(camera: Camera) -> Lens:
+def _make_lens(camera: Camera) -> Lens:
     return Lens(camera.model, tuple(map(float, camera.params)), camera.width, camera.height)
 
 
-def _pose(photo: Image) -> tuple[np.ndarray, np.ndarray]:
+def _read_pose(photo: Image) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world rotation (3,3) and world-to-camera translation (3,)."""
     return qvec2rotmat(photo.qvec).T.copy(), np.asarray(photo.tvec, dtype=np.float64)
 
 
-def _own_cloud(folder: Path, model_folder: Path, model: ColmapModel) -> StartCloud | None:
-    source, ply = _file(model_folder, _POINTS, "bin"), model_folder / f"{_POINTS}.ply"
+def _read_own_cloud(folder: Path, model_folder: Path, model: ColmapModel) -> StartCloud | None:
+    """Read the start cloud of a COLMAP model: its PLY if that is not older than the points, else its points."""
+    source, ply = _find_file(model_folder, _POINTS, "bin"), model_folder / f"{_POINTS}.ply"
     if ply.is_file():
         if source is None or not len(model.points.ids) or ply.stat().st_mtime >= source.stat().st_mtime:
             return StartCloud(read_point_cloud(ply), ply)
@@ -130,10 +133,10 @@ def find_model(scene: Path, with_points: bool = True) -> tuple[Path, ColmapModel
     """
     sparse = scene / "sparse"
     inside = sorted(path for path in sparse.iterdir() if path.is_dir())
-    folders = [folder for folder in dict.fromkeys([sparse / "0", sparse, *inside]) if not _lacking(folder)]
+    folders = [folder for folder in dict.fromkeys([sparse / "0", sparse, *inside]) if not _list_lacking(folder)]
     if not folders:
         for folder in (sparse / "0", sparse, *inside):
-            missing = _lacking(folder)
+            missing = _list_lacking(folder)
             if len(missing) < len(_NEEDED):
                 raise UserError(f"{folder} has no {missing[0]} as .bin or .txt; copy the whole model there")
         found = sorted(str(path.relative_to(scene)) for path in sparse.glob("**/*"))[:8]
@@ -160,6 +163,7 @@ def find_model(scene: Path, with_points: bool = True) -> tuple[Path, ColmapModel
 
 
 def _say_if_text_is_newer(folder: Path) -> None:
+    """Say that text files of a model are newer than its binary files, which are read."""
     binary = [folder / f"{name}.bin" for name in (*_NEEDED, _POINTS)]
     text = [path.with_suffix(".txt") for path in binary]
     both = [(b, t) for b, t in zip(binary, text, strict=True) if b.is_file() and t.is_file()]
@@ -178,7 +182,7 @@ def read_model(folder: Path, with_2d_points: bool = False, with_points: bool = T
     A file that is missing in one kind is taken in the other. with_points: False leaves out the points of a text file,
     which take a second for 300,000.
     """
-    kinds, errors = _kinds(folder), []
+    kinds, errors = _list_kinds(folder), []
     for suffix in kinds:
         try:
             model = read_model_of_kind(folder, suffix, with_2d_points, with_points)
@@ -198,9 +202,9 @@ def read_model_of_kind(
 
     UserError where one cannot be read or a photo's camera is missing.
     """
-    if suffix not in _kinds(folder):
+    if suffix not in _list_kinds(folder):
         raise UserError(f"no COLMAP model in {folder} as .{suffix}; choose the other kind with --model_type")
-    paths = [_file(folder, name, suffix) for name in (*_NEEDED, _POINTS)]
+    paths = [_find_file(folder, name, suffix) for name in (*_NEEDED, _POINTS)]
     binary = [path is not None and path.suffix == ".bin" for path in paths]
     try:
         cameras = read_cameras(paths[0], binary[0])
@@ -220,24 +224,24 @@ def read_model_of_kind(
     )
 
 
-def _file(folder: Path, name: str, suffix: str) -> Path | None:
+def _find_file(folder: Path, name: str, suffix: str) -> Path | None:
     """Find a file of a model, of this kind if there is one, else of the other; None if there is neither."""
     paths = (folder / f"{name}.{kind}" for kind in sorted(_SUFFIXES, key=lambda kind: kind != suffix))
     return next((path for path in paths if path.is_file()), None)
 
 
-def _kinds(folder: Path) -> list[str]:
+def _list_kinds(folder: Path) -> list[str]:
     """The kinds of a model's files, the binary one first; none where a file that every model has is missing."""
     there = [kind for kind in _SUFFIXES if any((folder / f"{name}.{kind}").is_file() for name in (*_NEEDED, _POINTS))]
-    return [] if _lacking(folder) else there
+    return [] if _list_lacking(folder) else there
 
 
-def _side_files(folder: Path) -> set[str]:
+def _list_side_files(folder: Path) -> set[str]:
     """The names of files that lie beside a model and are no part of it; those of the system are hidden."""
     own = {f"{name}.{kind}" for name in (*_NEEDED, _POINTS) for kind in _SUFFIXES} | {f"{_POINTS}.ply"}
     return {path.name for path in folder.iterdir() if path.is_file() and path.name[0] != "."} - own
 
 
-def _lacking(folder: Path) -> list[str]:
+def _list_lacking(folder: Path) -> list[str]:
     """The files of a model that a folder lacks."""
-    return [name for name in _NEEDED if not _file(folder, name, "bin")]
+    return [name for name in _NEEDED if not _find_file(folder, name, "bin")]

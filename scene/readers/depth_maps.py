@@ -155,18 +155,18 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
             "maps of the undistorted photos"
         )
     metric, is_colmap = Metric.from_folder(folder), (scene / "sparse").is_dir()
-    files = _files(info.train_cameras, scene, folder, is_colmap)
+    files = _index_depth_files(info.train_cameras, scene, folder, is_colmap)
     paths = [files.find(place, map_names(metric)) for place in range(len(info.train_cameras))]
     files.report_elsewhere("depth maps")
     if metric:
-        cameras = _with_metric_maps(info.train_cameras, paths, scene, folder, metric)
+        cameras = _add_metric_maps(info.train_cameras, paths, scene, folder, metric)
     else:
         # A map that is missing is named as it should be called.
         paths = [
             path or folder / f"{os.path.splitext(name)[0]}.png" for path, name in zip(paths, files.names, strict=True)
         ]
         if is_colmap:
-            cameras = _with_colmap_maps(info.train_cameras, paths, scene, folder)
+            cameras = _add_colmap_maps(info.train_cameras, paths, scene, folder)
         else:
             pairs = zip(info.train_cameras, paths, strict=True)
             # Inverse depth that render.py has written tells its unit.
@@ -174,10 +174,14 @@ def with_depth_maps(info: SceneInfo, scene: Path, depths: str) -> SceneInfo:
                 with_map(camera, path, None, 1 / (plane_scale(path) or 1 / BLENDER_UNIT)) for camera, path in pairs
             ]
     _check_files([camera for camera in cameras if camera.depth])
-    return replace(info, train_cameras=_with_depth(cameras, folder))
+    return replace(info, train_cameras=_drop_empty_maps(cameras, folder))
 
 
-def _files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: bool) -> SideFiles:
+def _index_depth_files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: bool) -> SideFiles:
+    """Prepare the search for the depth maps of views below `folder`, by the names of their photos.
+
+    Names are those of COLMAP's model (is_colmap), or paths of the photos from the folder `scene`.
+    """
     photos = [Path(camera.lying or camera.image_path) for camera in cameras]
     names = [
         camera.image_name if is_colmap or not camera.image_path else os.path.relpath(photo, scene)
@@ -186,7 +190,7 @@ def _files(cameras: Sequence[CameraInfo], scene: Path, folder: Path, is_colmap: 
     return SideFiles(folder, names, photos, scene)
 
 
-def _with_depth(cameras: list[CameraInfo], folder: Path) -> list[CameraInfo]:
+def _drop_empty_maps(cameras: list[CameraInfo], folder: Path) -> list[CameraInfo]:
     """Remove maps without any depth from the views; a message names them. UserError if all are such."""
     views = [camera for camera in cameras if camera.depth]
     with ThreadPoolExecutor(threads()) as pool:
@@ -218,7 +222,7 @@ def read_values(path: Path) -> np.ndarray:
     """Values (H, W) float64 of a .npy, a .pfm or a grey image file of 8 or 16 bits, unscaled. UserError for others."""
     try:
         if path.suffix.lower() == ".npy":
-            return _array(path).astype(np.float64)
+            return _open_array(path).astype(np.float64)
         with open_image(path) as image:
             if path.suffix.lower() == ".pfm":
                 return np.asarray(image, dtype=np.float64)
@@ -230,7 +234,7 @@ def read_values(path: Path) -> np.ndarray:
                 image = image.convert("RGB")
             values = np.asarray(image)
     except (*UNREADABLE, MemoryError) as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
     if values.ndim == 3:
         # Some tools write grey as three equal channels.
         if (values != values[..., :1]).any():
@@ -239,7 +243,7 @@ def read_values(path: Path) -> np.ndarray:
     return values.astype(np.float64)
 
 
-def _array(path: Path) -> np.ndarray:
+def _open_array(path: Path) -> np.ndarray:
     """The floats (H, W) of a .npy, which stay in the file. ValueError for other arrays."""
     values = np.load(plain_path(path), mmap_mode="r", allow_pickle=False)
     if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind != "f":
@@ -253,16 +257,16 @@ def map_size(path: Path) -> tuple[int, int]:
         return picture_size(path)
     try:
         if path.suffix.lower() == ".npy":
-            return _array(path).shape[::-1]
+            return _open_array(path).shape[::-1]
         with open_image(path) as image:
             if path.stat().st_size < image.tile[0][2] + 4 * image.width * image.height:
                 raise ValueError("it ends too early")
             return image.size
     except (*UNREADABLE, MemoryError) as error:
-        raise _unreadable(path, error) from error
+        raise _make_read_error(path, error) from error
 
 
-def _unreadable(path: Path, error: Exception) -> UserError:
+def _make_read_error(path: Path, error: Exception) -> UserError:
     return UserError(f"cannot read the depth map {path} ({str(error) or type(error).__name__}); make it again")
 
 
@@ -294,9 +298,13 @@ def sample(values: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return map_coordinates(values, [y, x], order=1, mode="nearest")
 
 
-def _with_colmap_maps(
+def _add_colmap_maps(
     cameras: Sequence[CameraInfo], paths: Sequence[Path], scene: Path, folder: Path
 ) -> list[CameraInfo]:
+    """Add the maps, `paths` in the order of the views, with the scales of depth_params.json.
+
+    A message names views without a reliable scale, which get no map. UserError if all are such.
+    """
     path = find_model(scene)[0] / PARAMS
     make = _MAKE.format(scene=scene, depths=folder)
     if not path.is_file():
@@ -324,9 +332,13 @@ def _with_colmap_maps(
     return found
 
 
-def _with_metric_maps(
+def _add_metric_maps(
     cameras: Sequence[CameraInfo], paths: Sequence[Path | None], scene: Path, folder: Path, metric: Metric
 ) -> list[CameraInfo]:
+    """Add the metric maps, `paths` in the order of the views, None for a view without one.
+
+    A message names views without a map. UserError for a map of another shape than its photo.
+    """
     is_colmap, found = (scene / "sparse").is_dir(), []
     if is_colmap and metric.scale is None:
         make = _MAKE.format(scene=scene, depths=folder)
@@ -366,6 +378,7 @@ def _read_params(path: Path, make: str) -> dict[str, dict[str, float]]:
 
 
 def _check_files(cameras: Sequence[CameraInfo]) -> None:
+    """Raise a UserError for maps that are missing, shared by several views, or much smaller than the photos."""
     paths = [camera.depth.path for camera in cameras]
     missing = [str(path) for path in paths if not path.is_file()]
     if missing:

@@ -31,15 +31,15 @@ def make_depth_params(scene: Path, depths: Path, model_type: str) -> tuple[dict[
     photo name without extension, both 0 if there are too few points. UserError when no photo has a map, no map
     can be fitted, or the scene has no COLMAP model.
     """
-    folder, model = _model(scene, model_type)
+    folder, model = _read_scene_model(scene, model_type)
     table, most, found = {}, 0, []
-    paths = _maps(scene, depths, model, None)
-    for image, path in _in_pairs(model, paths):
+    paths = _find_maps(scene, depths, model, None)
+    for image, path in _pair_with_bar(model, paths):
         camera = model.cameras[image.camera_id]
         pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
         name = Path(image.name).with_suffix("").as_posix()
         if path is not None:
-            values, z = _samples(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
+            values, z = _sample_map(pixels, z, (camera.width, camera.height), read_values(path) / UNIT)
             found.append((values, z))
             scale, offset = fit_line(values, 1 / z)
             table[name] = {"scale": scale, "offset": offset}
@@ -65,14 +65,14 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
     Returns units of the scene for each metre, how far half of the points are from it, as a part of it, and the numbers
     of maps and of registered photos. UserError as above, and for fewer than MIN_POINTS points in all maps.
     """
-    folder, model = _model(scene, model_type)
-    found, paths = [], _maps(scene, depths, model, metric)
-    for image, path in _in_pairs(model, paths):
+    folder, model = _read_scene_model(scene, model_type)
+    found, paths = [], _find_maps(scene, depths, model, metric)
+    for image, path in _pair_with_bar(model, paths):
         if path is not None:
             depth = metric._replace(scale=None).map_of(path)
             camera, values = model.cameras[image.camera_id], inverses(read_values(depth.path) / depth.unit)
             pixels, z = sightings(image, model.points, camera, f"{folder} as .{model_type}")
-            found.append(_samples(pixels, z, (camera.width, camera.height), values))
+            found.append(_sample_map(pixels, z, (camera.width, camera.height), values))
     check_direction(found, depths, METRIC)
     ratios = np.concatenate([(values * z)[np.isfinite(values)] for values, z in found]) if found else np.zeros(0)
     if len(ratios) < MIN_POINTS:
@@ -87,18 +87,19 @@ def make_metric_scale(scene: Path, depths: Path, metric: Metric, model_type: str
     return scale, float(np.median(np.abs(ratios / scale - 1))), len(found), len(model.images)
 
 
-def _maps(scene: Path, depths: Path, model: ColmapModel, metric: Metric | None) -> list[Path | None]:
+def _find_maps(scene: Path, depths: Path, model: ColmapModel, metric: Metric | None) -> list[Path | None]:
     """The files of the maps of a model's photos, found as training finds them."""
     names = [image.name for image in model.images]
     files = SideFiles(depths, names, [scene / "images" / name for name in names], scene)
     return [files.find(place, map_names(metric)) for place in range(len(names))]
 
 
-def _in_pairs(model: ColmapModel, paths: list[Path | None]) -> Bar:
+def _pair_with_bar(model: ColmapModel, paths: list[Path | None]) -> Bar:
     return Bar(list(zip(model.images, paths, strict=True)), desc="Fitting depth maps", unit="map")
 
 
-def _model(scene: Path, model_type: str) -> tuple[Path, ColmapModel]:
+def _read_scene_model(scene: Path, model_type: str) -> tuple[Path, ColmapModel]:
+    """Read the COLMAP model of a scene and return it with its folder. model_type: "bin" or "txt"."""
     if not (scene / "sparse").is_dir():
         raise UserError(
             f"no folder sparse in {scene}: maps are fitted to the points of a COLMAP model; name a COLMAP scene "
@@ -126,7 +127,10 @@ def sightings(image: Image, points: Points, camera: Camera, model: str) -> tuple
 
 
 def check_maps(info: SceneInfo, depths: Path) -> None:
-    """Refuse the maps of a scene's training views that its points contradict, as `check_direction`."""
+    """Raise a UserError if the points of a scene contradict the depth maps of its training views (`check_direction`).
+
+    depths: folder of the maps, for the message.
+    """
     if info.point_cloud is None or info.has_random_points:
         return
     points = np.asarray(info.point_cloud.points, np.float64)[:: 1 + len(info.point_cloud.points) // _POINTS]
@@ -138,14 +142,16 @@ def check_maps(info: SceneInfo, depths: Path) -> None:
         values = read_values(view.depth.path)
         metric = METRIC if view.depth.metric else ""
         pixels = np.stack([x, y], axis=1)[inside]
-        found.append(_samples(pixels, z, (view.width, view.height), inverses(values) if metric else values))
+        found.append(_sample_map(pixels, z, (view.width, view.height), inverses(values) if metric else values))
     check_direction(found, depths, metric)
 
 
 def check_direction(maps: Sequence[tuple[np.ndarray, np.ndarray]], depths: Path, metric: str = "") -> None:
-    """UserError where values (n,) of most maps, which should be inverse depths, grow with the depths z (n,) of points.
+    """Raise a UserError if the values of most maps rise with depth, as inverse depths never do.
 
-    metric: the file that says that maps are metric, of which values are the inverses; empty: they are not.
+    maps: for each map, inverse depths (n,) at points, and the depths z (n,) of these points.
+    depths: folder of the maps, for the message.
+    metric: name of the file that declares the maps metric, so that their values were inverted; empty: none does.
     """
     found = []
     for values, z in maps:
@@ -168,11 +174,11 @@ def fit_image(pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: n
 
     pixels (n,2) of a photo of a size (width, height), and their depths z (n,), as of `sightings`.
     """
-    mono, z = _samples(pixels, z, size, depth)
+    mono, z = _sample_map(pixels, z, size, depth)
     return fit_line(mono, 1 / z)
 
 
-def _samples(
+def _sample_map(
     pixels: np.ndarray, z: np.ndarray, size: tuple[int, int], depth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """A map's values, and z, at those of the points that are in front of the camera and in the photo."""

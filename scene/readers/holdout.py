@@ -26,9 +26,9 @@ def split(
     """Training and test views of cameras in the order of their names; without hold_out all train.
 
     rule: which are test views. "every8": every HOLD-th, the first included. "block": an eighth of them in succession,
-    from the middle. "sector": see `_sector`.
+    from the middle. "sector": see `_choose_sector`.
     """
-    rules = {EVERY: lambda cameras: range(0, len(cameras), HOLD), "block": _block, "sector": _sector}
+    rules = {EVERY: lambda cameras: range(0, len(cameras), HOLD), "block": _choose_block, "sector": _choose_sector}
     tests = set(rules[rule](cameras) if hold_out and cameras else ())
     train = [camera for index, camera in enumerate(cameras) if index not in tests]
     test = held_out([camera for index, camera in enumerate(cameras) if index in tests])
@@ -49,17 +49,17 @@ def refuse_rule(rule: str, listed: str | os.PathLike) -> None:
         raise UserError(f"{listed} lists the test photos of this scene; leave --holdout {rule} out")
 
 
-def _eighth(count: int) -> int:
+def _count_eighth(count: int) -> int:
     return max(2, (count + HOLD // 2) // HOLD)
 
 
-def _block(cameras: Sequence[CameraInfo]) -> range:
-    count = _eighth(len(cameras))
+def _choose_block(cameras: Sequence[CameraInfo]) -> range:
+    count = _count_eighth(len(cameras))
     first = (len(cameras) - count) // 2
     return range(first, first + count)
 
 
-def _sector(cameras: Sequence[CameraInfo]) -> np.ndarray:
+def _choose_sector(cameras: Sequence[CameraInfo]) -> np.ndarray:
     """Indices of an eighth of the cameras, at least two, that lie in one sector about the point that all look at.
 
     The point is the nearest one to all optical axes; angles are about what is up for the cameras. The sector begins at
@@ -79,12 +79,12 @@ def _sector(cameras: Sequence[CameraInfo]) -> np.ndarray:
     least = _SAME * float(np.median(np.linalg.norm(centers - found[0], axis=1)))
     places = np.array([min(near) for near in cKDTree(centers).query_ball_point(centers, least)])
     angles, count, around = angles[places], len(cameras), np.sort(angles[np.unique(places)])
-    ends = np.searchsorted(around, angles) + _eighth(len(around)) - 1
+    ends = np.searchsorted(around, angles) + _count_eighth(len(around)) - 1
     widths = (around[ends % len(around)] - angles) % 360
     fits = widths <= _WIDE * np.median(widths[np.unique(places)])
     twice, last = np.sort(np.concatenate([angles, angles + 360])), widths + 0.1**_ROUNDED / 2
     sizes = np.searchsorted(twice, angles + last) - np.searchsorted(twice, angles)
-    few = fits & (sizes <= 2 * _eighth(count))
+    few = fits & (sizes <= 2 * _count_eighth(count))
     by_name = np.roll(np.arange(count), -(count // 2))
     first = by_name[(few if few.any() else fits)[by_name].argmax()]
     return np.flatnonzero((angles - angles[first]) % 360 <= last[first])

@@ -135,6 +135,7 @@ class CameraInfo(_LikeNamedTuple):
     image: Any = None
 
     def __post_init__(self) -> None:
+        """Divide a scale out of R and T, and compute fields that follow from others."""
         values = vars(self)
         values["R"], values["T"] = rigid_pose(self.R, self.T, self.image_name)
         for fov, focal, center, side in _AXES:
@@ -302,13 +303,13 @@ def camera_centers(cameras: Sequence[CameraInfo]) -> np.ndarray:
     return np.array([camera_center(camera.R, camera.T) for camera in cameras])
 
 
-def up_of(turns: np.ndarray) -> np.ndarray:
-    """The up direction (3,), across the cameras' x axes as far as these differ: photographers hold them level.
+def up_of(rotations: np.ndarray) -> np.ndarray:
+    """Estimate the up direction (3,) of a scene from rotations (N,3,3) from camera to world axes.
 
-    turns: (N,3,3), from camera to world axes.
+    Photographers hold cameras level: up is perpendicular to the cameras' x axes, as far as these differ.
     """
-    sideward, upward = turns[:, :, 0], -turns[:, :, 1].mean(0)
-    up = np.linalg.solve(sideward.T @ sideward / len(turns) + _UNTURNED * np.eye(3), upward)
+    sideward, upward = rotations[:, :, 0], -rotations[:, :, 1].mean(0)
+    up = np.linalg.solve(sideward.T @ sideward / len(rotations) + _UNTURNED * np.eye(3), upward)
     return up / max(np.linalg.norm(up), 1e-12)
 
 
@@ -368,7 +369,7 @@ def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
     moved = bool(np.any(offset))
     train, test = info.train_cameras, info.test_cameras
     if moved:
-        train, test = ([_moved(camera, offset) for camera in cameras] for cameras in (train, test))
+        train, test = ([_move_camera(camera, offset) for camera in cameras] for cameras in (train, test))
     cloud, points = info.point_cloud, None
     if cloud is not None:
         with np.errstate(over="ignore"):  # the points become infinite, which start_rows refuses
@@ -380,5 +381,5 @@ def local(info: SceneInfo, offset: np.ndarray) -> SceneInfo:
     )
 
 
-def _moved(camera: CameraInfo, offset: np.ndarray) -> CameraInfo:
+def _move_camera(camera: CameraInfo, offset: np.ndarray) -> CameraInfo:
     return replace(camera, T=camera.T + camera.R.T @ offset)

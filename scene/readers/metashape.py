@@ -46,6 +46,7 @@ def cameras_xml(folder: Path) -> Path | None:
 
 
 def _is_metashape(path: Path) -> bool:
+    """Tell whether the head of a file is that of a Metashape export."""
     try:
         with open(plain_path(path), "rb") as file:
             head = file.read(_HEAD)
@@ -60,25 +61,28 @@ def read_metashape(path: Path, images: str) -> dict[str, Any]:
     images: the folder of the photos beside the file; without it they are looked for below the file's own. A message
     says which cameras have no pose.
     """
-    chunk = _chunk(path)
+    chunk = _read_chunk(path)
     try:
         lenses = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
         parts = [part for part in chunk.iter("component") if part.find("transform") is not None]
-        to_world = {part.get("id"): _similarity(part, path) for part in parts}
-        whole, folder = _similarity(chunk, path), path.parent / (images or "images")
+        to_world = {part.get("id"): _read_similarity(part, path) for part in parts}
+        whole, folder = _read_similarity(chunk, path), path.parent / (images or "images")
         folder = folder if folder.is_dir() else path.parent
         index, cameras = FileIndex(folder), list(chunk.find("cameras").iter("camera"))
         by_id, frames, without = {camera.get("id"): camera for camera in cameras}, [], []
         for camera in cameras:
             label, master = str(camera.get("label")), by_id.get(camera.get("master_id"), camera)
-            pose = _pose(camera, master, lenses)
+            pose = _read_pose(camera, master, lenses)
             if pose is None or camera.get("enabled", "1").lower() in ("0", "false"):
                 without.append(label)
                 continue
             scale, rotation, shift = to_world.get(camera.get("component_id", master.get("component_id")), whole)
             pose[:3, 3] = scale * rotation @ pose[:3, 3] + shift
             pose[:3, :3] = rotation @ pose[:3, :3] * (1, -1, -1)  # y down and z forward there
-            photo, lens = _photo(index, label, path) or folder / label, _lens(lenses[camera.get("sensor_id")], path)
+            photo, lens = (
+                _find_photo(index, label, path) or folder / label,
+                _read_lens(lenses[camera.get("sensor_id")], path),
+            )
             frames.append({"file_path": os.path.relpath(photo, path.parent), "transform_matrix": pose.tolist(), **lens})
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
@@ -94,7 +98,8 @@ def read_metashape(path: Path, images: str) -> dict[str, Any]:
     return {"frames": frames}
 
 
-def _chunk(path: Path) -> ElementTree.Element:
+def _read_chunk(path: Path) -> ElementTree.Element:
+    """Read the only chunk of a Metashape export. UserError for unreadable XML and other numbers of chunks."""
     try:
         if os.path.getsize(plain_path(path)) > MOST:
             raise ValueError(f"it has more than {MOST >> 20} MiB")
@@ -107,28 +112,28 @@ def _chunk(path: Path) -> ElementTree.Element:
     return chunks[0]
 
 
-def _numbers(element: ElementTree.Element, count: int) -> np.ndarray:
+def _read_numbers(element: ElementTree.Element, count: int) -> np.ndarray:
     values = np.array((element.text or "").split(), dtype=np.float64)
     if values.size != count:
         raise ValueError(f"{element.tag} has {values.size} numbers and needs {count}")
     return values
 
 
-def _pose(
+def _read_pose(
     camera: ElementTree.Element, master: ElementTree.Element, sensors: dict[str | None, ElementTree.Element]
 ) -> np.ndarray | None:
     """From the frame of a camera to the chunk's (4,4), if need be by the master camera of its rig; None: unknown."""
     if (place := camera.find("transform")) is not None:
-        return _numbers(place, 16).reshape(4, 4)
+        return _read_numbers(place, 16).reshape(4, 4)
     if (place := master.find("transform")) is None:
         return None
-    own, masters = (_in_rig(sensors[part.get("sensor_id")]) for part in (camera, master))
+    own, masters = (_read_rig_pose(sensors[part.get("sensor_id")]) for part in (camera, master))
     if own is None or masters is None:
         return None
-    return _numbers(place, 16).reshape(4, 4) @ np.linalg.inv(masters) @ own
+    return _read_numbers(place, 16).reshape(4, 4) @ np.linalg.inv(masters) @ own
 
 
-def _in_rig(sensor: ElementTree.Element) -> np.ndarray | None:
+def _read_rig_pose(sensor: ElementTree.Element) -> np.ndarray | None:
     """From the frame of a sensor to that of the rig (4,4), which is the master sensor's; None: unknown."""
     rotation, *places = map(sensor.find, ("rotation", *_PLACE))
     place = next((one for one in places if one is not None), None)
@@ -136,30 +141,30 @@ def _in_rig(sensor: ElementTree.Element) -> np.ndarray | None:
         return None
     pose = np.eye(4)
     if rotation is not None:
-        pose[:3, :3] = _numbers(rotation, 9).reshape(3, 3)
+        pose[:3, :3] = _read_numbers(rotation, 9).reshape(3, 3)
     if place is not None:
-        pose[:3, 3] = _numbers(place, 3)
+        pose[:3, 3] = _read_numbers(place, 3)
     return pose
 
 
-def _similarity(part: ElementTree.Element, path: Path) -> tuple[float, np.ndarray, np.ndarray]:
+def _read_similarity(part: ElementTree.Element, path: Path) -> tuple[float, np.ndarray, np.ndarray]:
     """Scale, rotation (3,3) and shift (3,) from the frame of a chunk or component to the world's.
 
     UserError for a scale that leaves no scene.
     """
     found = part.find("transform")
     parts = {} if found is None else {child.tag: child for child in found}
-    scale = float(_numbers(parts["scale"], 1)[0]) if "scale" in parts else 1.0
+    scale = float(_read_numbers(parts["scale"], 1)[0]) if "scale" in parts else 1.0
     if not 1 / _LARGEST <= scale <= _LARGEST:
         raise UserError(
             f"the {part.tag} in {path} has the scale {scale:g}, which no scene has; reset the transform of the chunk "
             "in Metashape, or set its reference again, and export the cameras again"
         )
-    rotation = _numbers(parts["rotation"], 9).reshape(3, 3) if "rotation" in parts else np.eye(3)
-    return scale, rotation, _numbers(parts["translation"], 3) if "translation" in parts else np.zeros(3)
+    rotation = _read_numbers(parts["rotation"], 9).reshape(3, 3) if "rotation" in parts else np.eye(3)
+    return scale, rotation, _read_numbers(parts["translation"], 3) if "translation" in parts else np.zeros(3)
 
 
-def _lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
+def _read_lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
     """The fields of a lens in transforms.json."""
     kind, size = str(sensor.get("type")), sensor.find("resolution")
     if kind not in _MODELS:
@@ -172,7 +177,7 @@ def _lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
     adjusted = next((found for found in every if found.get("class") == "adjusted"), every[-1] if every else None)
     if adjusted is None:
         raise UserError(f"a camera in {path} has no calibration; align its photos in Metashape, and export again")
-    values = {child.tag: float(_numbers(child, 1)[0]) for child in adjusted if child.tag in (*_LENS, *_REFUSED)}
+    values = {child.tag: float(_read_numbers(child, 1)[0]) for child in adjusted if child.tag in (*_LENS, *_REFUSED)}
     used = _USED[fields["camera_model"]]
     unknown = [name for name in _REFUSED if values.get(name) and name not in used]
     unknown += ["corrections"] * (adjusted.find("corrections") is not None)
@@ -188,7 +193,7 @@ def _lens(sensor: ElementTree.Element, path: Path) -> dict[str, Any]:
     return fields | {"cx": width / 2 + values.get("cx", 0.0), "cy": height / 2 + values.get("cy", 0.0)}
 
 
-def _photo(index: FileIndex, label: str, path: Path) -> Path | None:
+def _find_photo(index: FileIndex, label: str, path: Path) -> Path | None:
     """The photo of a label, which is a file's name, mostly without its suffix, in any sub-folder; None without one."""
     names = (label, *(label + suffix for suffix in SUFFIXES))
     photo = index.find(*names)

@@ -55,12 +55,14 @@ def read_polycam(keyframes: Path) -> dict[str, Any]:
     _say_left_out(len(photos.keys() ^ files.keys()), f"{keyframes / images} and {keyframes / cameras}")
     frames = []
     for name in sorted(photos.keys() & files.keys()):
-        with _of_an_export(files[name]):
+        with _explain_faults(files[name]):
             camera = read_json(files[name])
             pose = np.eye(4)
             pose[:3] = [[float(camera[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
             lens = {ours: float(camera[theirs]) for ours, theirs in _NAMES}
-        frames.append({"file_path": _below(keyframes.parent, photos[name]), "transform_matrix": pose.tolist(), **lens})
+        frames.append(
+            {"file_path": _name_below(keyframes.parent, photos[name]), "transform_matrix": pose.tolist(), **lens}
+        )
     return {"frames": frames}
 
 
@@ -71,7 +73,7 @@ def read_record3d(metadata: Path) -> dict[str, Any]:
     """
     folder = metadata.parent / dict(_RECORD3D)[metadata.name]
     numbered = {int(path.stem): path for path in folder.iterdir() if path.stem.isdecimal() and _is_photo(path)}
-    with _of_an_export(metadata):
+    with _explain_faults(metadata):
         content = read_json(metadata)
         poses = np.array(content["poses"], dtype=np.float64).reshape(-1, 7)
         fx, fy, cx, cy = np.array(content["K"], dtype=np.float64).reshape(9)[[0, 4, 6, 7]]  # by columns
@@ -87,7 +89,7 @@ def read_record3d(metadata: Path) -> dict[str, Any]:
         pose[:3] = np.column_stack([qvec2rotmat(np.array([w, x, y, z])), center])
         lens = dict(zip(("fl_x", "fl_y", "cx", "cy"), lenses[number].tolist(), strict=True))
         frames.append(
-            {"file_path": _below(metadata.parent, numbered[number]), "transform_matrix": pose.tolist(), **lens}
+            {"file_path": _name_below(metadata.parent, numbered[number]), "transform_matrix": pose.tolist(), **lens}
         )
     return {"frames": frames, **size}
 
@@ -96,11 +98,12 @@ def _is_photo(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES
 
 
-def _below(folder: Path, photo: Path) -> str:
+def _name_below(folder: Path, photo: Path) -> str:
     return photo.relative_to(folder).as_posix()
 
 
 def _say_left_out(count: int, where: str) -> None:
+    """Say how many photos or cameras of `where` lack a counterpart, if any."""
     if count:
         print(
             f"{count} photos or cameras of {where} have no counterpart of the same name and are ignored",
@@ -109,7 +112,8 @@ def _say_left_out(count: int, where: str) -> None:
 
 
 @contextmanager
-def _of_an_export(path: Path) -> Iterator[None]:
+def _explain_faults(path: Path) -> Iterator[None]:
+    """Raise a UserError in place of errors while the camera file of an export is read."""
     try:
         yield
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:

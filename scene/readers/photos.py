@@ -114,7 +114,7 @@ def to_pinholes(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Cam
     """
     sizes = picture_sizes([camera.image_path for camera in cameras])
     cameras = [replace(camera, file_size=size, opaque=opaque) for camera, size in zip(cameras, sizes, strict=True)]
-    cameras = _upright(cameras)
+    cameras = _make_upright(cameras)
     _check_shapes(cameras)
     for camera in cameras:
         if camera.mask is not None:
@@ -126,6 +126,10 @@ def to_pinholes(cameras: Sequence[CameraInfo], opaque: bool = False) -> list[Cam
 
 
 def _check_mask(mask: Path, size: tuple[int, int], lying: Path | None = None) -> None:
+    """Raise a UserError if a mask has another aspect ratio than its photo of a size (width, height).
+
+    lying: the photo's own file if it was turned upright, else None.
+    """
     mask_size = picture_size(mask)
     # A smaller mask has whole pixels, too: half of 269 is 134 or 135.
     if abs(size[0] * mask_size[1] - size[1] * mask_size[0]) > max(*size, *mask_size):
@@ -157,7 +161,7 @@ def _check_shapes(cameras: Sequence[CameraInfo]) -> None:
         print(f"{count} {fault}; the first is {name} ({sizes}){remedy * square}", file=sys.stderr)
 
 
-def _cache_subfolder(folder: Path, kind: str) -> Path:
+def _make_cache_subfolder(folder: Path, kind: str) -> Path:
     """Make a folder of the cache. UserError if that fails."""
     try:
         mkdir_p(folder)
@@ -166,7 +170,7 @@ def _cache_subfolder(folder: Path, kind: str) -> Path:
     return folder
 
 
-def _in_threads(work: Callable[[Job], Result], jobs: Iterable[Job], title: str) -> list[Result]:
+def _run_in_threads(work: Callable[[Job], Result], jobs: Iterable[Job], title: str) -> list[Result]:
     # pycolmap, Pillow and hashlib release Python's lock while they work.
     return in_threads(work, jobs, desc=title, unit="photo", leave=False)
 
@@ -177,21 +181,23 @@ def _is_exchanged(camera: CameraInfo) -> bool:
     return are_exchanged(camera.file_size, (lens.width, lens.height))
 
 
-def _upright(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
+def _make_upright(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
     """The views, with upright copies of the photos whose sides are exchanged and whose EXIF orientation says so.
 
     A message names them. UserError for a cache that cannot be written.
     """
     cameras = list(cameras)
-    turns = {n: turn for n, one in enumerate(cameras) if _is_exchanged(one) and (turn := _turn(one.image_path))}
+    turns = {n: turn for n, one in enumerate(cameras) if _is_exchanged(one) and (turn := _read_turn(one.image_path))}
     if not turns:
         return cameras
-    folder = _cache_subfolder(cache_folder() / "turned", "turned")
+    folder = _make_cache_subfolder(cache_folder() / "turned", "turned")
     remove_temporary_files(folder)
     photos = [Path(cameras[n].image_path) for n in turns]
-    paths = _in_threads(lambda photo: _upright_path(photo, folder), photos, "Looking up photos")
+    paths = _run_in_threads(lambda photo: _name_upright_copy(photo, folder), photos, "Looking up photos")
     copies = dict(zip(paths, turns, strict=True))  # one of equal photos
-    _in_threads(lambda path: _turn_photo(cameras[copies[path]], turns[copies[path]], path), copies, "Turning photos")
+    _run_in_threads(
+        lambda path: _turn_photo(cameras[copies[path]], turns[copies[path]], path), copies, "Turning photos"
+    )
     print(
         f"{len(turns)} of {len(cameras)} photos are turned as their EXIF orientation says, since their cameras are of "
         f"upright photos: {some([cameras[n].image_name for n in turns])}; the copies are kept in {folder}, which may "
@@ -206,7 +212,7 @@ def _upright(cameras: Sequence[CameraInfo]) -> list[CameraInfo]:
     return cameras
 
 
-def _turn(photo: Path) -> int | None:
+def _read_turn(photo: Path) -> int | None:
     """The EXIF orientation of a readable photo, if it exchanges the sides. Pillow itself turns TIFF files."""
     try:
         with open_image(photo) as image:
@@ -216,25 +222,26 @@ def _turn(photo: Path) -> int | None:
     return orientation if orientation in _TURNS else None
 
 
-def _upright_path(photo: Path, folder: Path) -> Path:
+def _name_upright_copy(photo: Path, folder: Path) -> Path:
     digest = hashlib.blake2b(plain_path(photo).read_bytes(), digest_size=20, person=_UPRIGHT_FORMAT)
     return folder / f"{digest.hexdigest()}.png"
 
 
 def _turn_photo(camera: CameraInfo, turn: int, path: Path) -> None:
+    """Write the upright copy of a lying photo to `path`, unless it is there. turn: its EXIF orientation."""
     photo, size = Path(camera.image_path), camera.file_size
     try:
         if picture_size(path) == size[::-1]:
             return
     except UserError:
         pass  # not made yet, or cut short
-    exif = _without_turn(photo)
+    exif = _read_exif_without_turn(photo)
     pixels = decode(photo, size).permute(1, 2, 0).numpy()
     with atomic_write(path, every_rank=True) as temporary:
         Image.fromarray(pixels).transpose(_TURNS[turn]).save(temporary, compress_level=1, exif=exif)
 
 
-def _without_turn(photo: Path) -> bytes:
+def _read_exif_without_turn(photo: Path) -> bytes:
     """The EXIF data of a photo, of the lens for instance, without its orientation; none if they are damaged."""
     with open_image(photo) as image:
         exif = image.getexif()
@@ -257,25 +264,26 @@ def undistort(photos: Sequence[CameraInfo]) -> list[CameraInfo]:
     Bilinear, as in COLMAP. Alpha is undistorted, too, and weights the colours. UserError for a broken photo or a cache
     that cannot be written.
     """
-    folder = _cache_subfolder(undistorted_folder(), "undistorted")
+    folder = _make_cache_subfolder(undistorted_folder(), "undistorted")
     _say_which_are_cut(photos)
     version = import_pycolmap().__version__
-    keys = _in_threads(lambda photo: _key(photo, version), photos, "Looking up undistorted photos")
+    keys = _run_in_threads(lambda photo: _hash_photo(photo, version), photos, "Looking up undistorted photos")
     paths = [folder / key[:2] / f"{key}.png" for key in keys]
     missing = {path: photo for path, photo in zip(paths, photos, strict=True) if not _is_cached(path)}
     if missing:
         remove_temporary_files(folder)
-        _in_threads(lambda item: _make(item[1], item[0]), missing.items(), "Undistorting photos")
+        _run_in_threads(lambda item: _write_undistorted(item[1], item[0]), missing.items(), "Undistorting photos")
         size = sum(path.stat().st_size for path in missing)
         print(
             f"{len(missing)} undistorted photos ({size / 1e6:.0f} MB) are kept in {folder}; it may be deleted at any "
             "time; set GS_CACHE to use another folder",
             file=sys.stderr,
         )
-    return [_result(photo, path) for photo, path in zip(photos, paths, strict=True)]
+    return [_refer_to_result(photo, path) for photo, path in zip(photos, paths, strict=True)]
 
 
 def _say_which_are_cut(photos: Sequence[CameraInfo]) -> None:
+    """Say how many photos of wide lenses are cut to a narrower field of view."""
     cut = [photo for photo in photos if undistortion(photo.lens, *photo.file_size).widest is not None]
     if cut:
         plan = undistortion(cut[0].lens, *cut[0].file_size)
@@ -287,7 +295,8 @@ def _say_which_are_cut(photos: Sequence[CameraInfo]) -> None:
         )
 
 
-def _key(photo: CameraInfo, version: str) -> str:
+def _hash_photo(photo: CameraInfo, version: str) -> str:
+    """Return the hash, hexadecimal, of all that an undistorted photo depends on. version: of the code that makes it."""
     digest = hashlib.blake2b(digest_size=20)
     mask = photo.mask and (photo.mask.inverted, photo.mask.meaning)
     digest.update(
@@ -316,23 +325,24 @@ def _is_cached(path: Path) -> bool:
         with open_image(path) as image:
             has_mask = image.info.get(_HAS_MASK)
         if has_mask == "yes":
-            picture_size(_mask_path(path))
+            picture_size(_name_mask(path))
     except UserError:
         return False
     return has_mask in ("yes", "no")
 
 
-def _mask_path(path: Path) -> Path:
+def _name_mask(path: Path) -> Path:
     return path.with_suffix(".mask.png")
 
 
-def _result(photo: CameraInfo, path: Path) -> CameraInfo:
-    mask = Mask(_mask_path(path)) if _mask_path(path).is_file() else None
+def _refer_to_result(photo: CameraInfo, path: Path) -> CameraInfo:
+    mask = Mask(_name_mask(path)) if _name_mask(path).is_file() else None
     size = photo.width, photo.height
     return replace(photo, image_path=path, file_size=size, mask=mask, ignore_alpha=False, opaque=False, lens=None)
 
 
-def _make(photo: CameraInfo, path: Path) -> None:
+def _write_undistorted(photo: CameraInfo, path: Path) -> None:
+    """Write a photo without distortion to `path`, and the mask of its pixels that count if not all do."""
     plan = undistortion(photo.lens, *photo.file_size)
     pixels = decode(photo.image_path, photo.file_size, photo.opaque).permute(1, 2, 0).numpy()
     counts = np.ones(pixels.shape[:2], bool)
@@ -350,7 +360,7 @@ def _make(photo: CameraInfo, path: Path) -> None:
     if not counts.all():
         # Interpolation mixes neighbours: a pixel counts only if all that contribute to it count.
         visible = visible & (_warp(np.where(counts, 255, 0).astype(np.uint8), plan) == 255)
-    mask_path = _mask_path(path)
+    mask_path = _name_mask(path)
     has_mask = not visible.all()
     if has_mask:
         with atomic_write(mask_path, every_rank=True) as temporary:
@@ -363,6 +373,7 @@ def _make(photo: CameraInfo, path: Path) -> None:
 
 
 def _warp_picture(pixels: np.ndarray, plan: Undistortion) -> np.ndarray:
+    """Undistort pixels (H, W, 3 or 4) uint8; colours are weighed by alpha."""
     if pixels.shape[2] == 3:
         return _warp(pixels, plan)
     alpha = _warp(pixels[..., 3], plan)

@@ -59,7 +59,7 @@ def read_point_cloud(path: Path) -> BasicPointCloud:
     if one is above 255. Points without colours are grey, and a message says so.
     UserError for a file that is missing, of another kind, or has points that are not finite.
     """
-    cloud = _read(path)
+    cloud = _read_cloud(path)
     return BasicPointCloud(cloud.points, cloud.colors.astype(np.float32), cloud.normals)
 
 
@@ -68,7 +68,7 @@ def fetchPly(path: str | os.PathLike) -> BasicPointCloud:
 
     Points that float32 cannot hold stay float64. Kinds of files and errors as for `read_point_cloud`.
     """
-    cloud = _read(Path(path))
+    cloud = _read_cloud(Path(path))
     points = cloud.points.astype(np.float32)
     points = points if np.array_equal(points, cloud.points) else cloud.points
     return BasicPointCloud(points, cloud.colors.astype(np.float64), cloud.normals)
@@ -80,7 +80,7 @@ def storePly(path: str | os.PathLike, xyz: np.ndarray, rgb: np.ndarray) -> None:
 
 
 @np.errstate(over="ignore")  # doubles that float32 cannot hold become Inf, which is refused
-def _read(path: Path) -> BasicPointCloud:
+def _read_cloud(path: Path) -> BasicPointCloud:
     """The cloud with colours as exact as the file has them."""
     if not os.path.isfile(path):  # Path.is_file raises an error for a name that is too long
         raise UserError(f"no point cloud {path}; give the path of a PLY, npz or text file of points")
@@ -101,6 +101,7 @@ def _read(path: Path) -> BasicPointCloud:
 
 
 def _begins_with(path: Path, magic: bytes) -> bool:
+    """Tell whether a file begins with some bytes. UserError if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(len(magic)) == magic
@@ -120,17 +121,17 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     if missing:
         raise UserError(f"the point cloud {path} has no {', '.join(missing)}; it needs x y z and red green blue")
     try:
-        points = _columns(vertices, names, _POSITION).astype(np.float64)
+        points = _stack_columns(vertices, names, _POSITION).astype(np.float64)
         normals = np.zeros_like(points, dtype=np.float32)
         if names.keys() >= set(_NORMAL):
-            normals[:] = _columns(vertices, names, _NORMAL)
+            normals[:] = _stack_columns(vertices, names, _NORMAL)
         channels = next((group for group in _COLORS if names.keys() & set(group)), None)
         if channels is None:
             return points, None, normals
         missing = [name for name in channels if name not in names]
         if missing:
             raise UserError(f"the point cloud {path} has {channels[0]} but no {', '.join(missing)}; export it again")
-        colors = _columns(vertices, names, channels)
+        colors = _stack_columns(vertices, names, channels)
     except (TypeError, ValueError) as error:
         raise UserError(f"the point cloud {path} has lists instead of numbers; export it again") from error
     if channels == _SH:  # a Gaussian model
@@ -138,7 +139,7 @@ def _read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     return points, colors, normals
 
 
-def _columns(vertices: np.ndarray, names: Mapping[str, str], wanted: Sequence[str]) -> np.ndarray:
+def _stack_columns(vertices: np.ndarray, names: Mapping[str, str], wanted: Sequence[str]) -> np.ndarray:
     return np.stack([vertices[names[name]] for name in wanted], axis=1)
 
 
@@ -163,6 +164,7 @@ def color_fractions(colors: np.ndarray, path: object) -> np.ndarray:
 
 
 def _read_npz(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read points (N, 3) float64 and colours (N, 3), None without, from an .npz file."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             points, colors = (
@@ -197,7 +199,7 @@ def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Points and colours (N,3) float64 as the file has them; None where it has no colours. UserError for other text."""
     try:
         lines = path.read_text(encoding=encoding_of(path), errors="replace").splitlines()
-        first, header, counted = _text_header(lines)
+        first, header, counted = _read_text_header(lines)
         lines = lines[first:]
         if any(";" in line or _DECIMAL_COMMAS.fullmatch(line) for line in lines[:_LOOKED_AT]):
             lines = [line.replace(",", ".").replace(";", " ") for line in lines]
@@ -206,7 +208,7 @@ def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
             table = np.loadtxt([line.replace(",", " ") for line in lines], dtype=np.float64, ndmin=2)
         if not table.size:
             raise ValueError("no numbers")
-        points, colors = _columns_of_text(table, header, counted or path.suffix.lower() == ".pts")
+        points, colors = _choose_columns(table, header, counted or path.suffix.lower() == ".pts")
     except (ValueError, OSError, MemoryError) as error:
         raise UserError(
             f"{path} is neither PLY nor npz, and not text with x y z or x y z red green blue a line ({error}); export "
@@ -215,7 +217,7 @@ def _read_text(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     return table[:, points], None if colors is None else table[:, colors]
 
 
-def _text_header(lines: list[str]) -> tuple[int, list[str], bool]:
+def _read_text_header(lines: list[str]) -> tuple[int, list[str], bool]:
     """The index of the first line of numbers, the names of columns before it, and whether a count of points is."""
     header, counted = [], False
     for index, line in enumerate(lines):
@@ -230,7 +232,7 @@ def _text_header(lines: list[str]) -> tuple[int, list[str], bool]:
     return len(lines), header, counted
 
 
-def _columns_of_text(table: np.ndarray, header: list[str], counted: bool) -> tuple[list[int], list[int] | slice | None]:
+def _choose_columns(table: np.ndarray, header: list[str], counted: bool) -> tuple[list[int], list[int] | slice | None]:
     """The columns of positions, and those of colours, None without any. ValueError for an unknown number of them."""
     count = table.shape[1]
     if len(header) == count:

@@ -35,21 +35,21 @@ def kind_of(source_path: str | os.PathLike) -> str:
             f"{folder} is an archive (a .r3d is a ZIP, too); unpack it, and give -s the folder that comes out"
         )
     if not folder.is_dir():
-        raise UserError(f"{folder} is a file; give -s the folder of the scene{_scene_hint(scene_above(folder.parent))}")
-    kind = _kind(folder)
+        raise UserError(f"{folder} is a file; give -s the folder of the scene{_hint_scene(scene_above(folder.parent))}")
+    kind = _find_kind(folder)
     if kind is None:
         found = sorted(path.name for path in folder.iterdir())
         raise UserError(
             f"{folder} is not a scene: looked for the folder sparse (COLMAP), the files transforms_train.json "
             "(Blender) and transforms.json (nerfstudio), and exports of Metashape, Polycam and Record3D, found "
-            f"{some(found)}; {_remedy(folder)}"
+            f"{some(found)}; {_find_remedy(folder)}"
         )
     return kind
 
 
 def is_scene(folder: str | os.PathLike) -> bool:
     """Tell whether a folder has cameras of one of the kinds."""
-    return _kind(Path(folder)) is not None
+    return _find_kind(Path(folder)) is not None
 
 
 def describe_verdict(folder: str | os.PathLike) -> str:
@@ -63,7 +63,7 @@ def describe_verdict(folder: str | os.PathLike) -> str:
 
 def is_unrelated(folder: Path) -> bool:
     """Tell whether a folder is no scene and no model, has no scene in it, and is in none."""
-    return not (_scenes_in(folder) or scene_above(folder) or (folder / "cfg_args").is_file())
+    return not (_find_scenes(folder) or scene_above(folder) or (folder / "cfg_args").is_file())
 
 
 class Capture(NamedTuple):
@@ -84,7 +84,7 @@ class Capture(NamedTuple):
 def find_capture(folder: Path) -> Capture:
     """Find the photos and videos of a folder by their names, without hidden ones and the videos of Live Photos."""
     place = folder / "input"
-    here, inner = _visible(folder, folder.glob("*")), _visible(place, place.rglob("*"))
+    here, inner = _list_visible(folder, folder.glob("*")), _list_visible(place, place.rglob("*"))
     photos = [path for path in inner or here if path.suffix.lower() in PHOTO_SUFFIXES]
     stills = {path.with_suffix("") for path in photos} if len(photos) >= FEWEST else set()
     videos = [path for path in inner or here if path.suffix.lower() in VIDEO_SUFFIXES]
@@ -93,7 +93,7 @@ def find_capture(folder: Path) -> Capture:
     return Capture(place if inner else folder, photos, videos, beside)
 
 
-def _visible(folder: Path, paths: Iterable[Path]) -> list[Path]:
+def _list_visible(folder: Path, paths: Iterable[Path]) -> list[Path]:
     """The files among the paths below a folder, sorted, without hidden ones and those in hidden folders."""
     seen = (path for path in paths if not any(part.startswith(".") for part in path.relative_to(folder).parts))
     return sorted(path for path in seen if path.is_file())
@@ -112,7 +112,8 @@ def how_to_convert(folder: Path) -> str:
     return f"rename its folder {which} to input and run {command}" if inner else ""
 
 
-def _kind(folder: Path) -> str | None:
+def _find_kind(folder: Path) -> str | None:
+    """Return the kind of scene in a folder: COLMAP, BLENDER or NERFSTUDIO; None for another folder."""
     if (folder / "sparse").is_dir():
         return COLMAP
     if (folder / "transforms_train.json").is_file():
@@ -128,10 +129,11 @@ def camera_file(folder: Path) -> Path | None:
     return polycam_capture(folder) or record3d_capture(folder) or cameras_xml(folder)
 
 
-def _remedy(folder: Path) -> str:
+def _find_remedy(folder: Path) -> str:
+    """Return the advice for a folder that is no scene, by its contents."""
     if (folder / "cfg_args").is_file():
         return "it is a model that train.py wrote: give it as -m, and its scene as -s"
-    if below := _scenes_in(folder):
+    if below := _find_scenes(folder):
         return f"give -s a scene in it: {some(list(map(str, below)))}"
     if above := scene_above(folder):
         return f"give -s {above}, which is a scene"
@@ -144,16 +146,16 @@ def _remedy(folder: Path) -> str:
     return "give -s the folder that holds one of them"
 
 
-def _scenes_in(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.is_dir() and path.name != WORK and _kind(path))
+def _find_scenes(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_dir() and path.name != WORK and _find_kind(path))
 
 
 def scene_above(folder: Path) -> Path | None:
     """The scene that contains this folder, at most two levels up, as for images/left or sparse/0."""
-    return next((path for path in (folder, *folder.absolute().parents[:2]) if _kind(path)), None)
+    return next((path for path in (folder, *folder.absolute().parents[:2]) if _find_kind(path)), None)
 
 
-def _scene_hint(scene: Path | None) -> str:
+def _hint_scene(scene: Path | None) -> str:
     return f", {scene}" if scene else ""
 
 

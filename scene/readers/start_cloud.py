@@ -54,15 +54,16 @@ def scene_info(
 
     own: reads the scene's points, if it has any; lacking: start of the message when it has none. random: makes others.
     """
-    start = StartCloud(None, None) if options is None else _choose(options, own, random, lacking)
+    start = StartCloud(None, None) if options is None else _choose_cloud(options, own, random, lacking)
     points = None if start.cloud is None else start.cloud.points
     size = normalization(views[0], points)
     return SceneInfo(start.cloud, *views, size, start.ply_path, is_nerf_synthetic, has_random_points=start.is_random)
 
 
-def _choose(
+def _choose_cloud(
     options: StartOptions, own: Callable[[], StartCloud | None], random: Callable[[], BasicPointCloud], lacking: str
 ) -> StartCloud:
+    """Return the points that the options choose. own, random, lacking: see `scene_info`."""
     if isinstance(options.points, BasicPointCloud):
         return StartCloud(options.points, None)
     if options.points:
@@ -79,30 +80,32 @@ def _choose(
 
 
 def random_for_blender(cameras: list[CameraInfo], source: object) -> BasicPointCloud:
-    """Grey points spread evenly over a cube around the origin, as in the reference for Blender scenes.
+    """Make grey points, spread evenly over the reference's cube around the origin if the cameras look at that cube.
 
-    Where the cameras look at another place, or at one of another size, they are in a cube there; where they do not
-    stand around one, `random_in_frusta`. A message naming the source says so.
+    If the cameras look at another place, or at one of another size, the points are in a cube there. If the cameras look
+    at no common place, the points are those of `random_in_frusta`. A message says so in both cases.
+
+    source: file of the cameras, for the message.
     """
     turns, moves = np.array([camera.R for camera in cameras]), np.array([camera.T for camera in cameras])
     widths = np.array([camera.width / camera.fx for camera in cameras])
     sizes = RANDOM_HALF_SIZE / np.maximum(moves[:, 2] * widths, 1e-9) / _CUBE
     aside = np.linalg.norm(moves[:, :2], axis=1) > _OFF * RANDOM_HALF_SIZE
     if np.median(aside | (sizes < 1 / _LARGER) | (sizes > _LARGER)) == 0:
-        return _in_cube(np.zeros(3), RANDOM_HALF_SIZE)
+        return _fill_cube(np.zeros(3), RANDOM_HALF_SIZE)
     said = f"the cameras of {source} do not look at the cube of {2 * RANDOM_HALF_SIZE:g} units around the origin that"
     said += " those of Blender scenes look at, so random points are put"
     focus = nearest_to_axes(camera_centers(cameras), turns[:, :, 2])
     if focus and focus[1] < scene_extent(cameras):
         middle, half = focus[0], _CUBE * focus[1] * float(np.median(widths))
         print(f"{said} into a cube of {2 * half:.3g} around the place that they look at", file=sys.stderr)
-        return _in_cube(middle, half)
+        return _fill_cube(middle, half)
     print(f"{said} into the views; their axes must be those of OpenGL, y up and z backward", file=sys.stderr)
     return random_in_frusta(cameras)
 
 
-def _in_cube(middle: np.ndarray, half: float) -> BasicPointCloud:
-    return _grey(np.random.default_rng(0).uniform(-half, half, (RANDOM_POINTS, 3)) + middle)
+def _fill_cube(middle: np.ndarray, half: float) -> BasicPointCloud:
+    return _make_grey(np.random.default_rng(0).uniform(-half, half, (RANDOM_POINTS, 3)) + middle)
 
 
 def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
@@ -114,7 +117,7 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
     random = np.random.default_rng(0)
     chosen = random.integers(len(cameras), size=RANDOM_POINTS)
     x, y = random.uniform(size=(2, RANDOM_POINTS))
-    depth = _focus_distance(cameras) * random.uniform(_NEAREST, _FARTHEST, RANDOM_POINTS)
+    depth = _measure_focus_distance(cameras) * random.uniform(_NEAREST, _FARTHEST, RANDOM_POINTS)
     points = np.empty((RANDOM_POINTS, 3))
     for index, camera in enumerate(cameras):
         mine = chosen == index
@@ -125,10 +128,10 @@ def random_in_frusta(cameras: list[CameraInfo]) -> BasicPointCloud:
             local = [np.sin(across) * np.cos(down), np.sin(down), np.cos(across) * np.cos(down)]
         local = np.stack(local, axis=1) * depth[mine, None]
         points[mine] = local @ camera.R.T + camera.center
-    return _grey(points)
+    return _make_grey(points)
 
 
-def _focus_distance(cameras: list[CameraInfo]) -> float:
+def _measure_focus_distance(cameras: list[CameraInfo]) -> float:
     extent = scene_extent(cameras)
     focus = nearest_to_axes(camera_centers(cameras), np.array([camera.R[:, 2] for camera in cameras]))
     return focus[1] if focus and focus[1] > 0.1 * extent else extent
@@ -150,6 +153,6 @@ def nearest_to_axes(centers: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, 
     return (focus, distance) if distance > 0 else None
 
 
-def _grey(points: np.ndarray) -> BasicPointCloud:
+def _make_grey(points: np.ndarray) -> BasicPointCloud:
     grey = np.full(points.shape, _GREY, dtype=np.float32)
     return BasicPointCloud(points, grey, np.zeros_like(grey))

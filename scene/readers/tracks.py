@@ -27,15 +27,15 @@ from scene.readers.info import NEAREST, CameraInfo, SceneInfo, as_camera_info
 from scene.readers.scene_folder import COLMAP, kind_of
 
 _FAR = 1.5  # sizes of the photo from its middle; undistortion moves 2D points out of it by less
-FEWEST = 12  # points of a track; fewer say too little of a pose
+FEWEST = 12  # points of a photo; fewer say too little of a pose
 NEAR_SHARE = 0.01  # of the points in view; usual scenes have none nearer than NEAREST, and one with 0.026 lost 2.5 dB
 _USUAL = 2.0  # depth that all but NEAR_SHARE of the points in view have in usual scenes: 2.2 to 3.6 in nine
 _CAMERAS = 16  # whose depths are looked at
 _SAMPLE = 5000  # points
 
 
-class Track(NamedTuple):
-    """The track of a photo: its points (K, 3) float64 in the training's frame, and their rays (K, 2), x / z and y / z.
+class PhotoPoints(NamedTuple):
+    """The 3D points (K, 3) float64 that a photo shows, in the training's frame, and their rays (K, 2), x / z and y / z.
 
     angular: a ray is the angle from the axis (radians) times the direction in the image, as a fisheye shows it: it may
     be 90 degrees or more. places (K, 2): in the photo, in parts of its width and height. errors: of reprojection, in
@@ -51,8 +51,10 @@ class Track(NamedTuple):
     angular: bool = False
 
 
-def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: np.ndarray) -> list[Track | None]:
-    """The tracks of views; None for a view of fewer than FEWEST points, and in scenes that are not COLMAP's.
+def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: np.ndarray) -> list[PhotoPoints | None]:
+    """Read the points that each view shows, from the tracks of a COLMAP model.
+
+    A view of fewer than FEWEST points has None, and so have all views of scenes that are not COLMAP's.
 
     offset (3,): of the training's frame (scene/readers/info.py). UserError where the model cannot be read.
     """
@@ -72,7 +74,7 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
             continue
         place = np.minimum(np.searchsorted(points.ids, photo.point3D_ids), len(points.ids) - 1)
         camera, angular = cameras[photo.camera_id], view.native is not None and view.native.chart == "equidistant"
-        rays = _angles(camera, photo.xys) if angular else _rays(camera, photo.xys, view)
+        rays = _compute_angular_rays(camera, photo.xys) if angular else _compute_rays(camera, photo.xys, view)
         has_point = points.ids[place] == photo.point3D_ids
         places, longest = photo.xys / (camera.width, camera.height), max(camera.width, camera.height)
         errors, local = points.errors[place], (points.xyz[place] - offset) @ view.R + view.T
@@ -84,7 +86,7 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
         dropped += int((has_point & ~sound & (visible | ~near)).sum())
         taken = has_point & sound & visible
         place, places, errors = place[taken], places[taken], errors[taken]
-        track = Track(points.xyz[place] - offset, rays[taken], places, errors, lengths[place], place, angular)
+        track = PhotoPoints(points.xyz[place] - offset, rays[taken], places, errors, lengths[place], place, angular)
         found.append(track if len(place) >= FEWEST else None)
     if dropped:
         fault = "lie far outside of their photo, or have a reprojection error that is larger than it or no number"
@@ -93,7 +95,7 @@ def read_tracks(scene: str | os.PathLike, views: Sequence[CameraInfo], offset: n
 
 
 def rays_to(local: np.ndarray, angular: bool) -> np.ndarray:
-    """Rays (N, 2) of points (N, 3) of a view's frame, as `Track` has them; NaN where there is none."""
+    """Rays (N, 2) of points (N, 3) of a view's frame, as `PhotoPoints` has them; NaN where there is none."""
     aside, z = local[:, :2], local[:, 2:]
     if not angular:
         return aside / np.where(z > 0, z, np.nan)
@@ -101,13 +103,13 @@ def rays_to(local: np.ndarray, angular: bool) -> np.ndarray:
     return aside * np.where(away > 0, np.arctan2(away, z) / np.where(away > 0, away, 1.0), 0.0)
 
 
-def _angles(camera: Camera, places: np.ndarray) -> np.ndarray:
+def _compute_angular_rays(camera: Camera, places: np.ndarray) -> np.ndarray:
     """Angular rays (N, 2) of a fisheye's places (N, 2); NaN where it shows nothing."""
     lens = lens_of(camera.model, tuple(map(float, camera.params)))
     return numbers_of(lens, torch.from_numpy(places - 0.5), camera.width, camera.height).numpy()
 
 
-def _rays(camera: Camera, places: np.ndarray, view: CameraInfo) -> np.ndarray:
+def _compute_rays(camera: Camera, places: np.ndarray, view: CameraInfo) -> np.ndarray:
     """Rays (N, 2) x / z and y / z of places (N, 2) in a camera's photo; NaN where there is none.
 
     Of a wide lens that is undistorted, those that the pinhole in its place shows: farther out, noise grows without end.
@@ -124,7 +126,7 @@ def projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.nd
     """Pixel coordinates x, y of points (N, 3), and whether they are in front of the camera and inside its photo."""
     local = points @ camera.R + camera.T
     if camera.native:
-        return _through_lens(camera.native, local, camera.width, camera.height)
+        return _project_through_lens(camera.native, local, camera.width, camera.height)
     front = local[:, 2] > 0
     depth = np.where(front, local[:, 2], 1.0)
     x = camera.fx * local[:, 0] / depth + camera.cx
@@ -132,7 +134,7 @@ def projected(camera: CameraInfo, points: np.ndarray) -> tuple[np.ndarray, np.nd
     return x, y, front & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
 
 
-def _through_lens(
+def _project_through_lens(
     lens: NativeLens, local: np.ndarray, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """`projected` of points in the camera's frame, by the rasterizer: it shows small Gaussians there."""
@@ -150,22 +152,22 @@ def _through_lens(
 
 def enlargement(info: SceneInfo) -> float:
     """A power of two by which a scene is enlarged where it is drawn; 1 where at most a few points are too near."""
-    depths = _depths(info)
+    depths = _collect_depths(info)
     usual = float(np.quantile(depths, NEAR_SHARE)) if len(depths) else NEAREST
     return 1.0 if usual >= NEAREST else float(2.0 ** np.ceil(np.log2(_USUAL / usual)))
 
 
-def _depths(info: SceneInfo) -> np.ndarray:
+def _collect_depths(info: SceneInfo) -> np.ndarray:
     """Depths of points, each in each photo that shows it; of a lens that is taken as it is, distances."""
     if info.point_cloud is None:
         return np.zeros(0)
     points = np.asarray(info.point_cloud.points, dtype=np.float64)
     points = points[np.isfinite(points).all(axis=1)]  # a training refuses the others
     sample, views = points[:: -(-len(points) // _SAMPLE) or 1], info.train_cameras
-    return np.concatenate([_of_view(as_camera_info(view), sample) for view in views[:: -(-len(views) // _CAMERAS)]])
+    return np.concatenate([_find_depths(as_camera_info(view), sample) for view in views[:: -(-len(views) // _CAMERAS)]])
 
 
-def _of_view(view: CameraInfo, points: np.ndarray) -> np.ndarray:
+def _find_depths(view: CameraInfo, points: np.ndarray) -> np.ndarray:
     local = points @ view.R + view.T
     depths = np.linalg.norm(local, axis=1) if view.native else local[:, 2]
     return depths[projected(view, points)[2] & (depths > 0)]

@@ -66,11 +66,11 @@ def read_blender(
         if not path.is_file():
             raise UserError(f"no {path.name} in {folder}, which --eval needs; export it, or leave --eval out")
     train = read_frames(files[0], masks, suffixes, images)
-    test = _test_frames(files[1], masks, suffixes, images, hold_out)
+    test = _read_test_frames(files[1], masks, suffixes, images, hold_out)
     if hold_out:
-        train, test = _without_tests(_unique(train, str(files[0])), held_out(_unique(test, str(files[1]))), folder)
+        train, test = _drop_tests(_dedupe(train, str(files[0])), held_out(_dedupe(test, str(files[1]))), folder)
     else:
-        train, test = _unique(train + test, str(folder)), []
+        train, test = _dedupe(train + test, str(folder)), []
     if not train:
         raise UserError(f"{files[0]} lists no frames; export the scene again")
 
@@ -78,7 +78,7 @@ def read_blender(
         return random_for_blender(train, files[0])
 
     def own() -> StartCloud:
-        ply = _ply_in(folder)
+        ply = _find_ply(folder)
         return StartCloud(read_point_cloud(ply), ply) if ply else StartCloud(random(), None, is_random=True)
 
     lacking = f"{folder / 'points3d.ply'} has no points"
@@ -90,11 +90,11 @@ def read_poses(path: Path) -> list[Posed]:
 
     A message names the masks that the file gives, which nobody reads here.
     """
-    content = _read(path)
+    content = _read_frame_list(path)
     note_unread(path, "transforms", {name for one in (content, *content["frames"]) for name in _MASKS if one.get(name)})
     frames = enumerate(content["frames"], start=1)
     return [
-        Posed(str(frame["file_path"]), *_pose(path, number, frame), partial(_lens, path, content, frame))
+        Posed(str(frame["file_path"]), *_read_pose(path, number, frame), partial(_read_lens, path, content, frame))
         for number, frame in frames
     ]
 
@@ -103,12 +103,13 @@ def read_frames(
     path: Path, masks: MaskOptions = NO_MASKS, suffixes: Sequence[str] = SUFFIXES, images: str = ""
 ) -> list[CameraInfo]:
     """The views of one of a Blender scene's two files, in its order."""
-    return _cameras(path, _read(path), masks, suffixes, images, by_stem=True)
+    return _make_cameras(path, _read_frame_list(path), masks, suffixes, images, by_stem=True)
 
 
-def _test_frames(
+def _read_test_frames(
     path: Path, masks: MaskOptions, suffixes: Sequence[str], images: str, needed: bool
 ) -> list[CameraInfo]:
+    """Read the test views of a file. needed: errors are raised; else they are printed, and the list is empty."""
     if not needed and not path.is_file():
         return []
     try:
@@ -120,12 +121,12 @@ def _test_frames(
         return []
 
 
-def _without_tests(
+def _drop_tests(
     train: list[CameraInfo], test: list[CameraInfo], listed_by: Path
 ) -> tuple[list[CameraInfo], list[CameraInfo]]:
     """Leave out training views whose photo is also a test view's."""
-    tests = {_file(view) for view in test}
-    left = [view for view in train if _file(view) not in tests]
+    tests = {_clean_path(view) for view in test}
+    left = [view for view in train if _clean_path(view) not in tests]
     if train and not left:
         raise UserError(
             f"all training photos of {listed_by} are test photos, too; list other training photos, or leave --eval out"
@@ -136,23 +137,23 @@ def _without_tests(
     return left, test
 
 
-def _unique(views: list[CameraInfo], listed_by: str) -> list[CameraInfo]:
+def _dedupe(views: list[CameraInfo], listed_by: str) -> list[CameraInfo]:
     """Leave out further views of the same photo. UserError if their poses differ."""
     found: dict[str, CameraInfo] = {}
     for view in views:
-        first = found.setdefault(_file(view), view)
+        first = found.setdefault(_clean_path(view), view)
         if not (np.allclose(first.R, view.R, atol=_SAME) and np.allclose(first.center, view.center, _SAME, _SAME)):
-            raise UserError(f"{listed_by} lists the photo {_file(view)} twice, with different poses; keep one")
+            raise UserError(f"{listed_by} lists the photo {_clean_path(view)} twice, with different poses; keep one")
     if len(found) < len(views):
         print(f"{len(views) - len(found)} frames of {listed_by} repeat a photo and are left out", file=sys.stderr)
     return list(found.values())
 
 
-def _file(view: CameraInfo) -> str:
+def _clean_path(view: CameraInfo) -> str:
     return os.path.normpath(view.lying or view.image_path)
 
 
-def _ply_in(folder: Path) -> Path | None:
+def _find_ply(folder: Path) -> Path | None:
     """points3d.ply of a folder, in letters of any case."""
     return max((path for path in folder.iterdir() if path.name.lower() == "points3d.ply"), default=None)
 
@@ -174,8 +175,8 @@ def read_nerfstudio(
     ply_file_path, else from a points3D.ply beside it. Arguments and errors as for `scene.dataset_readers.read_scene`.
     """
     path = camera_file(folder) or folder / "transforms.json"
-    content = _read(path, partial(_content, images=images))
-    read = partial(_cameras, path, masks=masks, suffixes=SUFFIXES, images=images, by_stem=False, native=native)
+    content = _read_frame_list(path, partial(_read_content, images=images))
+    read = partial(_make_cameras, path, masks=masks, suffixes=SUFFIXES, images=images, by_stem=False, native=native)
     try:
         cameras = read(content)
     except UserError as error:
@@ -184,19 +185,19 @@ def read_nerfstudio(
         content = {**content, "frames": content["frames"][: -len(content["test_frames"])], "test_frames": []}
         cameras = read(content)
         print(f"the test_frames of {path} are not used for training: {error}", file=sys.stderr)
-    tests = {_file(view) for view in cameras[len(cameras) - len(content["test_frames"]) :]}
-    cameras = _unique(cameras, str(path))
+    tests = {_clean_path(view) for view in cameras[len(cameras) - len(content["test_frames"]) :]}
+    cameras = _dedupe(cameras, str(path))
     cameras.sort(key=lambda camera: os.fsencode(camera.image_name))
     if not cameras:
         raise UserError(f"{path} lists no frames; export the scene again")
-    if views := _own_split(path, content, cameras, tests, hold_out):
+    if views := _read_own_split(path, content, cameras, tests, hold_out):
         refuse_rule(rule, path)
     else:
         views = split(cameras, hold_out, rule, folder)
 
     def own() -> StartCloud | None:
         name = content.get("ply_file_path")
-        ply = (FileIndex(folder).find(str(name)) or folder / str(name)) if name else _ply_in(folder)
+        ply = (FileIndex(folder).find(str(name)) or folder / str(name)) if name else _find_ply(folder)
         return StartCloud(read_point_cloud(ply), ply) if ply else None
 
     nothing = "names no points (ply_file_path)" if path.name == "transforms.json" else "is an export without points"
@@ -204,7 +205,7 @@ def read_nerfstudio(
     return scene_info(views, start, own, lambda: random_in_frusta(views[0]), lacking)
 
 
-def _content(path: Path, images: str) -> dict[str, Any]:
+def _read_content(path: Path, images: str) -> dict[str, Any]:
     """Read the content of a camera file, or convert another program's export into it."""
     if path.is_dir():
         return read_polycam(path)
@@ -213,7 +214,7 @@ def _content(path: Path, images: str) -> dict[str, Any]:
     return read_json(path) if path.name == "transforms.json" else read_record3d(path)
 
 
-def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]:
+def _read_frame_list(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]:
     """A camera file's content, with a list of frames that have a file_path and a transform_matrix.
 
     Those of test_frames are the last of them. A message names fields that are not used and may change the result.
@@ -224,12 +225,12 @@ def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]
         content["test_frames"] = list(content.get("test_frames") or ())
         content["frames"] = frames + content["test_frames"]
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise _no_camera_file(path, error) from error
+        raise _make_content_error(path, error) from error
     for number, frame in enumerate(content["frames"], start=1):
         lacking = [key for key in ("file_path", "transform_matrix") if not isinstance(frame, dict) or key not in frame]
         if lacking:
             fault = f"has no {' and no '.join(lacking)}; fix the frame, or take it out"
-            raise UserError(f"{_where(path, number, frame)} {fault}")
+            raise UserError(f"{_name_frame(path, number, frame)} {fault}")
     for part in (content, *content["frames"]):
         for key in part:
             if key.endswith("_path") and isinstance(part[key], str):
@@ -239,6 +240,7 @@ def _read(path: Path, load: Callable[[Path], Any] = read_json) -> dict[str, Any]
 
 
 def _say_what_is_unused(path: Path, content: dict[str, Any]) -> None:
+    """Note the entries of a transforms file that are set and that nothing here reads."""
     frames = content["frames"]
     told = {name for frame in frames for name, value in frame.items() if name not in _READ and _is_set(value)}
     if len({str(frame.get("time")) for frame in frames}) < 2:
@@ -252,19 +254,19 @@ def _is_set(value: Any) -> bool:
     return bool(np.any(np.array(value, dtype=object)))
 
 
-def _where(path: Path, number: int, frame: Any) -> str:
+def _name_frame(path: Path, number: int, frame: Any) -> str:
     name = f" ({frame['file_path']})" if isinstance(frame, dict) and "file_path" in frame else ""
     return f"frame {number}{name:.80} of {path}"
 
 
-def _no_camera_file(path: Path, error: Exception) -> UserError:
+def _make_content_error(path: Path, error: Exception) -> UserError:
     return UserError(
         f"{path} is not a camera file ({type(error).__name__}: {error}); it needs camera_angle_x or fl_x, and frames, "
         "each with file_path and a 4x4 transform_matrix"
     )
 
 
-def _cameras(
+def _make_cameras(
     path: Path,
     content: dict[str, Any],
     masks: MaskOptions,
@@ -275,7 +277,7 @@ def _cameras(
 ) -> list[CameraInfo]:
     """The views in the order of the frames, named by the stems or by the relative paths of their files."""
     frames = content["frames"]
-    poses = [_pose(path, number, frame) for number, frame in enumerate(frames, start=1)]
+    poses = [_read_pose(path, number, frame) for number, frame in enumerate(frames, start=1)]
     listed = [str(frame["file_path"]) for frame in frames]
     remedy = f"put them there, or take their frames out of {path.name} to go on without"
     if place := other_folder(path, listed, images, suffixes):
@@ -283,10 +285,10 @@ def _cameras(
     else:
         photos = find_images(path.parent, listed, str(path), remedy, suffixes)
     names = [os.path.relpath(photo, path.parent) for photo in photos]
-    found = _masks(path, frames, names, photos, masks)
+    found = _find_frame_masks(path, frames, names, photos, masks)
     sizes, cameras = picture_sizes(photos), []
     for index, (frame, photo, mask, (R, T)) in enumerate(zip(frames, photos, found, poses, strict=True)):
-        lens = _lens(path, content, frame, sizes[index])
+        lens = _read_lens(path, content, frame, sizes[index])
         if circle := circle_of(frame, content, lens.width, path):
             mask = replace(mask or Mask(photo, drawn=False), circle=circle)
         name = photo.stem if by_stem else names[index]
@@ -294,14 +296,14 @@ def _cameras(
     return to_pinholes(cameras, masks.drop_alpha)
 
 
-def _lens(path: Path, content: dict[str, Any], frame: dict[str, Any], size: tuple[int, int]) -> Lens:
+def _read_lens(path: Path, content: dict[str, Any], frame: dict[str, Any], size: tuple[int, int]) -> Lens:
     try:
         return lens_of(frame, content, size, path)
     except (ValueError, TypeError, OverflowError) as error:
-        raise _no_camera_file(path, error) from error
+        raise _make_content_error(path, error) from error
 
 
-def _pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+def _read_pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     """Camera-to-world rotation (3,3) and world-to-camera translation (3,), y down and z forward.
 
     The file has an OpenGL camera-to-world matrix (y up, z backward).
@@ -316,15 +318,16 @@ def _pose(path: Path, number: int, frame: dict[str, Any]) -> tuple[np.ndarray, n
             raise ValueError(f"the last row of transform_matrix must be 0 0 0 1, got {matrix[3]}")
     except (ValueError, TypeError, OverflowError, np.linalg.LinAlgError) as error:
         raise UserError(
-            f"{_where(path, number, frame)} has no usable pose ({type(error).__name__}: {error}); it needs a "
+            f"{_name_frame(path, number, frame)} has no usable pose ({type(error).__name__}: {error}); it needs a "
             "transform_matrix of 4x4 finite numbers that can be inverted"
         ) from error
     return inverse[:3, :3].T.copy(), inverse[:3, 3].copy()
 
 
-def _masks(
+def _find_frame_masks(
     path: Path, frames: list[dict[str, Any]], names: list[str], photos: list[Path], masks: MaskOptions
 ) -> list[Mask | None]:
+    """Find the mask of each frame, None without one: as `mask_path` names it, or by the options' folder."""
     listed = [frame.get("mask_path") for frame in frames]
     if masks.folder or not any(listed):
         return find_masks(path.parent, names, masks, photos)
@@ -336,11 +339,11 @@ def _masks(
         if mask and mask.path.samefile(photo):
             fault = "names the photo itself as its mask (mask_path)"
             remedy = "name a mask file, or take mask_path out and use alpha channels by --mask_meaning ignore"
-            raise UserError(f"{_where(path, number, frames[number - 1])} {fault}; {remedy}")
+            raise UserError(f"{_name_frame(path, number, frames[number - 1])} {fault}; {remedy}")
     return found
 
 
-def _own_split(
+def _read_own_split(
     path: Path, content: dict[str, Any], cameras: list[CameraInfo], tests: set[str], hold_out: bool
 ) -> tuple[list[CameraInfo], list[CameraInfo]] | None:
     """Training and test views by the file's lists, and by the photos of its test_frames; None without any of them, or
@@ -368,7 +371,7 @@ def _own_split(
     trained, tested = ({identity(file) for file in files.values()} for files in (lists[0], lists[2] or lists[1]))
     test, train, left = [], [], []
     for camera, photo in zip(cameras, photos, strict=True):
-        is_test = photo in tested or _file(camera) in tests
+        is_test = photo in tested or _clean_path(camera) in tests
         (test if is_test else train if photo in trained or not lists[0] else left).append(camera)
     if not test or not train:
         raise UserError(

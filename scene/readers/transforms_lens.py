@@ -44,7 +44,7 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
     fields = {**shared, **frame}
     model = str(fields.get("camera_model") or ("FISHEYE" if fields.get("is_fisheye") else "PERSPECTIVE")).upper()
     names = (_ARIA_TERMS if model == _ARIA else _TERMS).split()
-    fields = {**_with_terms(shared, names, file), **_with_terms(frame, names, file)}
+    fields = {**_add_terms(shared, names, file), **_add_terms(frame, names, file)}
 
     def number(name: str, default: float) -> float:
         value = fields.get(name)
@@ -69,11 +69,11 @@ def lens_of(frame: Mapping[str, Any], shared: Mapping[str, Any], size: tuple[int
     angle_y = fields.get("camera_angle_y")
     fy = number("fl_y", fx if angle_y is None or fields.get("fl_x") is not None else fov2focal(float(angle_y), height))
     pinhole = (fx, fy, number("cx", width / 2), number("cy", height / 2))
-    colmap, terms = _colmap_model(model, [number(name, 0.0) for name in _ARIA_TERMS.split()], file)
+    colmap, terms = _choose_model(model, [number(name, 0.0) for name in _ARIA_TERMS.split()], file)
     return Lens(colmap, (*pinhole, *terms), width, height)
 
 
-def _with_terms(fields: Mapping[str, Any], names: Sequence[str], file: Path) -> dict[str, Any]:
+def _add_terms(fields: Mapping[str, Any], names: Sequence[str], file: Path) -> dict[str, Any]:
     """The fields, with those that a list in them stands for."""
     listed = fields.get("distortion_params") or []
     if not isinstance(listed, list) or len(listed) not in (0, len(names)):
@@ -84,7 +84,7 @@ def _with_terms(fields: Mapping[str, Any], names: Sequence[str], file: Path) -> 
     return {**fields, **dict(zip(names, listed, strict=False))}
 
 
-def _colmap_model(model: str, terms: Sequence[float], file: Path) -> tuple[str, tuple[float, ...]]:
+def _choose_model(model: str, terms: Sequence[float], file: Path) -> tuple[str, tuple[float, ...]]:
     """COLMAP's camera model with such a distortion, and its parameters. terms: those of _ARIA_TERMS."""
     k1, k2, k3, k4, k5, k6, p1, p2, *_ = terms
     if model == _ARIA:

@@ -78,7 +78,7 @@ def stored_offset(path: str | os.PathLike) -> tuple[float, float, float]:
             with contextlib.suppress(ValueError):
                 offset = tuple(float(word) for word in words[2:])
                 if all(map(math.isfinite, offset)):
-                    return _checked(offset, path)
+                    return _check_offset(offset, path)
     return 0.0, 0.0, 0.0
 
 
@@ -93,7 +93,8 @@ def stored_enlargement(path: str | os.PathLike) -> float:
     return 1.0
 
 
-def _checked(offset: tuple[float, float, float], path: str | os.PathLike) -> tuple[float, float, float]:
+def _check_offset(offset: tuple[float, float, float], path: str | os.PathLike) -> tuple[float, float, float]:
+    """Return a world offset (world units) unless it is larger than supported; then raise a UserError."""
     farthest = max(map(abs, offset))
     if farthest > LARGEST_OFFSET:
         raise UserError(
@@ -129,14 +130,14 @@ def read_plain_ply(path: str | os.PathLike) -> Splats:
     columns = {name: values.numpy() for name, values in read_ply(path, None, further=False).items()}
     offset = stored_offset(path)
     if any(line.split() in (["property", "double", "x"], ["property", "float64", "x"]) for line in header_lines(path)):
-        columns["xyz"], origin = _near_origin(path, columns["xyz"])
-        offset = _checked(tuple((origin + offset).tolist()), path)
+        columns["xyz"], origin = _move_near_origin(path, columns["xyz"])
+        offset = _check_offset(tuple((origin + offset).tolist()), path)
     sh = np.concatenate([columns["f_dc"], columns["f_rest"]], axis=1)
     values = (columns["xyz"], columns["scaling"], columns["rotation"], columns["opacity"][:, 0], sh)
     return Splats(*values, says_antialiasing(path), offset, stored_enlargement(path))
 
 
-def _near_origin(path: str | os.PathLike, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _move_near_origin(path: str | os.PathLike, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The positions (N,3) of a PLY of doubles as float32, and their origin (3,), which is zero unless they are far."""
     vertices = read_vertices(path)
     places = np.stack([np.asarray(vertices[axis], np.float64) for axis in "xyz"], axis=1)
@@ -159,7 +160,7 @@ def write_compressed_ply(path: str | os.PathLike, splats: Splats) -> None:
 
 def packed_ply(splats: Splats) -> PlyData:
     """The tables of a compressed PLY and its comments."""
-    order, padding = _in_chunks(splats)
+    order, padding = _order_in_chunks(splats)
     splats = selected(splats, order)
     count = len(splats)
     first = np.arange(0, count, CHUNK)
@@ -182,22 +183,22 @@ def packed_ply(splats: Splats) -> PlyData:
     vertex["packed_color"] = pack(np.column_stack([parts["color"], opacities(splats)]), 8, 8, 8, 8)
     for name in _VISIBLE:
         vertex[name][padding] = 0
-    chunks = _table("chunk", sum(_COLUMNS.values(), []), np.concatenate(ranges, axis=1), "<f4")
+    chunks = _make_element("chunk", sum(_COLUMNS.values(), []), np.concatenate(ranges, axis=1), "<f4")
     elements = [chunks, PlyElement.describe(vertex, "vertex")]
     if splats.sh_degree:
         codes = np.floor((splats.sh[:, 1:] / np.float32(SH_RANGE) + np.float32(0.5)) * 256)  # float64 would take GBs
         codes = codes.clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(count, 3 * (splats.sh.shape[1] - 1))
-        elements.append(_table("sh", [f"f_rest_{i}" for i in range(codes.shape[1])], codes, "u1"))
+        elements.append(_make_element("sh", [f"f_rest_{i}" for i in range(codes.shape[1])], codes, "u1"))
     return PlyData(elements, byte_order="<", comments=comments(splats))
 
 
-def _in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
+def _order_in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the splats in the order of the file, and which of them are padding.
 
     Those within _FAR usual distances come first, then those within _FAR times that, and so on.
     """
     shells = np.zeros(len(splats))
-    for distances, usual in (_from_the_middle(splats), spread(splats.sh[:, 0])[1:]):
+    for distances, usual in (_measure_from_middle(splats), spread(splats.sh[:, 0])[1:]):
         shells = np.maximum(shells, np.ceil(np.log(np.maximum(distances / usual, 1)) / np.log(_FAR)) - 1)
     order, padding = np.zeros(0, np.int64), np.zeros(0, bool)
     for shell in np.unique(shells):
@@ -209,7 +210,7 @@ def _in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:
     return order, padding
 
 
-def _from_the_middle(splats: Splats) -> tuple[np.ndarray, float]:
+def _measure_from_middle(splats: Splats) -> tuple[np.ndarray, float]:
     """Distances (N,) from the middle, and the usual one; of the smallest splats, if they stand far closer together.
 
     So they do amid a sky of more splats than all else.
@@ -223,7 +224,7 @@ def _from_the_middle(splats: Splats) -> tuple[np.ndarray, float]:
     return np.linalg.norm(splats.means.astype(np.float64) - middle, axis=1), close
 
 
-def _table(name: str, columns: list[str], values: np.ndarray, kind: str) -> PlyElement:
+def _make_element(name: str, columns: list[str], values: np.ndarray, kind: str) -> PlyElement:
     form = np.dtype([(column, kind) for column in columns])
     return PlyElement.describe(unstructured_to_structured(values, form), name)
 
@@ -241,10 +242,10 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
         if len(chunks) != -(-len(vertex) // CHUNK):
             raise ValueError(f"{len(chunks)} chunks for {len(vertex)} splats")
         rest = _read_rest(ply, len(vertex))
-        means = _between(chunks, "position", chunk_of, unpack(position, 11, 10, 11))
-        log_scales = _between(chunks, "scale", chunk_of, unpack(scale, 11, 10, 11))
+        means = _scale_between(chunks, "position", chunk_of, unpack(position, 11, 10, 11))
+        log_scales = _scale_between(chunks, "scale", chunk_of, unpack(scale, 11, 10, 11))
         rgba = unpack(color, 8, 8, 8, 8)
-        rgb = _between(chunks, "color", chunk_of, rgba[:, :3]) if "min_r" in chunks.dtype.names else rgba[:, :3]
+        rgb = _scale_between(chunks, "color", chunk_of, rgba[:, :3]) if "min_r" in chunks.dtype.names else rgba[:, :3]
     except (PlyParseError, ValueError, KeyError, TypeError, OverflowError, EOFError, MemoryError) as error:
         raise UserError(f"{path} is not a complete compressed PLY ({error}); save or download it again") from error
     note_unread(path, "ply", set(vertex.dtype.names) - {*_PACKED})
@@ -257,7 +258,7 @@ def read_compressed_ply(path: str | os.PathLike) -> Splats:
     return whole if visible.all() else selected(whole, visible)
 
 
-def _between(chunks: np.ndarray, group: str, chunk_of: np.ndarray, parts: np.ndarray) -> np.ndarray:
+def _scale_between(chunks: np.ndarray, group: str, chunk_of: np.ndarray, parts: np.ndarray) -> np.ndarray:
     ends = np.stack([np.asarray(chunks[name], np.float64) for name in _COLUMNS[group]], axis=1)[chunk_of]
     low, high = ends[:, :3], ends[:, 3:]
     return low + (high - low) * parts

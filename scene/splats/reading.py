@@ -23,14 +23,14 @@ def is_point_cloud(path: str | os.PathLike) -> bool:
     """Tell whether a file has points instead of splats: a PLY without their properties, or a file of another kind."""
     if not os.path.isfile(path) or Path(path).suffix.lower() in (".splat", ".spz", *CHECKPOINTS, *_OTHERS):
         return False
-    names = _properties(path)
+    names = _read_properties(path)
     if names is None:
         with open(path, "rb") as file:
             return not file.read(4).startswith(_SPZ)
     return not names & {"f_dc_0", "opacity", "scale_0", "rot_0", "packed_position"}
 
 
-def _properties(path: str | os.PathLike) -> set[str] | None:
+def _read_properties(path: str | os.PathLike) -> set[str] | None:
     """The names of a PLY's properties, without CloudCompare's prefix; None for another file."""
     lines = [line.split() for line in header_lines(path)]
     names = (words[-1] for words in lines if words[:1] == ["property"])
@@ -51,7 +51,7 @@ def read_splats(path: str | os.PathLike) -> Splats:
             begin = file.read(4)
     except OSError as error:
         raise UserError(f"cannot read {path} ({error.strerror}); fix its permissions") from error
-    if (properties := _properties(path)) is not None:
+    if (properties := _read_properties(path)) is not None:
         read = read_compressed_ply if "packed_position" in properties else read_plain_ply
     elif begin.startswith(_SPZ):
         read = read_spz

@@ -139,12 +139,12 @@ def rotated(splats: Splats, turn: np.ndarray) -> Splats:
         splats,
         means=(splats.means @ turn.T).astype(np.float32),
         rotations=rotation.as_quat(scalar_first=True).astype(np.float32),
-        sh=np.einsum("jk,nkc->njc", _sh_turn(splats.sh_degree, turn).astype(np.float32), splats.sh),
+        sh=np.einsum("jk,nkc->njc", _make_sh_rotation(splats.sh_degree, turn).astype(np.float32), splats.sh),
         world_offset=(0.0, 0.0, 0.0),
     )
 
 
-def _sh_turn(degree: int, turn: np.ndarray) -> np.ndarray:
+def _make_sh_rotation(degree: int, turn: np.ndarray) -> np.ndarray:
     """The matrix (K,K) of SH coefficients: the new function at a direction d is the old one at turn^T d."""
     directions = torch.randn(_DIRECTIONS, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     directions = torch.nn.functional.normalize(directions)

@@ -63,39 +63,39 @@ class _Header(NamedTuple):
 def write_spz(path: str | os.PathLike, splats: Splats, version: int = WRITTEN[0]) -> None:
     """Write one of the versions WRITTEN, whole or not at all. UserError without zstandard, which version 4 needs."""
     zstandard = find_zstandard(path) if version == 4 else None
-    splats = _drawn_in(splats)
+    splats = _move_farthest_in(splats)
     warn_of_sizes([splats])
     splats = selected(splats, morton_order(splats.means))
-    content = _packed_by_zstd(splats, zstandard) if zstandard else packed_spz(splats, version)
+    content = _pack_by_zstd(splats, zstandard) if zstandard else packed_spz(splats, version)
     with atomic_write(path) as temporary:
         temporary.write_bytes(content)
 
 
-def _packed_by_zstd(splats: Splats, zstandard: ModuleType) -> bytes:
+def _pack_by_zstd(splats: Splats, zstandard: ModuleType) -> bytes:
     """Pack a whole file of version 4."""
     splats = half_rotated(splats)
-    bits, streams = _streams(splats, _rotation_codes(splats.rotations))
+    bits, streams = _encode_streams(splats, _encode_rotations(splats.rotations))
     compressor = zstandard.ZstdCompressor(level=_LEVEL, write_checksum=True)
     packed = [compressor.compress(stream) for stream in streams]
     table = b"".join(struct.pack("<QQ", len(p), len(s)) for p, s in zip(packed, streams, strict=True))
-    header = _packed_header(4, splats, bits, len(streams)) + _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
+    header = _pack_header(4, splats, bits, len(streams)) + _HEADER_END.pack(_HEADER.size + _HEADER_END.size)
     return header + table + b"".join(packed)
 
 
 def packed_spz(splats: Splats, version: int) -> bytes:
     """Pack a whole file of version 2 or 3, splats in their order. UserError for positions that it cannot hold."""
     splats = half_rotated(splats)
-    rotations = _three_bytes if version == 2 else _rotation_codes
-    bits, streams = _streams(splats, rotations(splats.rotations))
-    return gzip.compress(_packed_header(version, splats, bits, 0) + b"".join(streams), mtime=0)
+    rotations = _encode_three_bytes if version == 2 else _encode_rotations
+    bits, streams = _encode_streams(splats, rotations(splats.rotations))
+    return gzip.compress(_pack_header(version, splats, bits, 0) + b"".join(streams), mtime=0)
 
 
-def _packed_header(version: int, splats: Splats, bits: int, streams: int) -> bytes:
+def _pack_header(version: int, splats: Splats, bits: int, streams: int) -> bytes:
     flags = _ANTIALIASED if splats.antialiasing else 0
     return _HEADER.pack(MAGIC, version, len(splats), splats.sh_degree, bits, flags, streams)
 
 
-def _streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
+def _encode_streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
     """Bits of a position's fraction, and the attributes of splats with OpenGL's axes. rotations: of the version."""
     farthest = float(np.abs(splats.means).max(initial=0))
     if farthest > _LARGEST_POSITION:
@@ -105,7 +105,7 @@ def _streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
         )
     bits = int(np.clip(np.floor(np.log2(_LARGEST_POSITION / max(farthest, 1e-30))), 0, _MOST_BITS))
     tables = [
-        _fixed_point(splats.means, bits),
+        _encode_fixed_point(splats.means, bits),
         to_bytes(opacities(splats) * 255),
         to_bytes((splats.sh[:, 0].astype(np.float64) * _COLOR + 0.5) * 255),
         to_bytes((splats.log_scales.astype(np.float64) + 10) * 16),
@@ -116,7 +116,7 @@ def _streams(splats: Splats, rotations: np.ndarray) -> tuple[int, list[bytes]]:
     return bits, [table.tobytes() for table in tables]
 
 
-def _drawn_in(splats: Splats) -> Splats:
+def _move_farthest_in(splats: Splats) -> Splats:
     """Move the farthest splats nearer and shrink them, so that they look the same from the middle.
 
     All positions have the same step, which one splat far away would make coarse. A message counts the changed splats.
@@ -159,12 +159,12 @@ def find_zstandard(path: str | os.PathLike) -> ModuleType:
     return zstandard
 
 
-def _fixed_point(means: np.ndarray, bits: int) -> np.ndarray:
+def _encode_fixed_point(means: np.ndarray, bits: int) -> np.ndarray:
     fixed = np.clip(np.round(means.astype(np.float64) * 2**bits), -_LARGEST_POSITION, _LARGEST_POSITION)
     return fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[:, :, :3]
 
 
-def _three_bytes(wxyz: np.ndarray) -> np.ndarray:
+def _encode_three_bytes(wxyz: np.ndarray) -> np.ndarray:
     """Rotations of version 2. A reader finds w by the others, whose rounding matters much where w is small.
 
     So x, y and z are each rounded down or up by what gives the nearest rotation.
@@ -180,7 +180,7 @@ def _three_bytes(wxyz: np.ndarray) -> np.ndarray:
     return best
 
 
-def _rotation_codes(wxyz: np.ndarray) -> np.ndarray:
+def _encode_rotations(wxyz: np.ndarray) -> np.ndarray:
     largest, three = smallest_three(np.roll(wxyz, -1, axis=1))
     size = np.floor(np.abs(three) * np.sqrt(2) * 511 + 0.5).clip(0, 511).astype(np.uint32)
     first, second, third = (size | (three < 0).astype(np.uint32) << 9).T
@@ -197,7 +197,7 @@ def read_spz(path: str | os.PathLike) -> Splats:
         raise UserError(f"{path} is not a complete SPZ file ({error}); save or download it again") from error
 
 
-def _header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
+def _read_header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
     """The header at the start of unpacked bytes. size: bytes of the file. ValueError unless it can be what it says."""
     magic, *fields = _HEADER.unpack_from(content)
     header = _Header(*fields)
@@ -210,13 +210,13 @@ def _header(content: bytes, versions: tuple[int, ...], size: int) -> _Header:
     return header
 
 
-def _widths(header: _Header) -> list[int]:
+def _list_widths(header: _Header) -> list[int]:
     """Bytes a splat of each stream: positions, opacities, colours, scales, rotations, SH bands."""
     position, rotation = 6 if header.version == 1 else 9, 3 if header.version < 3 else 4
     return [position, 1, 3, 3, rotation, 3 * ((header.degree + 1) ** 2 - 1)]
 
 
-def _axes(records: bytes, header: _Header, path: str | os.PathLike) -> str:
+def _read_axes(records: bytes, header: _Header, path: str | os.PathLike) -> str:
     """The axes that a record declares, or OpenGL's. What else records and flags say is named."""
     place, axes, others = 0, "RUB", []
     while place < len(records):
@@ -237,11 +237,12 @@ def _axes(records: bytes, header: _Header, path: str | os.PathLike) -> str:
 
 
 def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
-    header = _header(content, (4,), len(content))
+    """Read a file of version 4: streams compressed by Zstandard. path: for messages."""
+    header = _read_header(content, (4,), len(content))
     (table,) = _HEADER_END.unpack_from(content, _HEADER.size)
     zstandard = find_zstandard(path)
     begin, parts = table + 16 * header.streams, []
-    for index, width in enumerate(_widths(header)):
+    for index, width in enumerate(_list_widths(header)):
         size = width * header.count
         packed, whole = struct.unpack_from("<QQ", content, table + 16 * index) if index < header.streams else (0, 0)
         if whole != size:
@@ -255,24 +256,30 @@ def _read_zstd(content: bytes, path: str | os.PathLike) -> Splats:
             raise ValueError(f"stream {index}: {error}") from error
         begin += packed
     records = content[_HEADER.size + _HEADER_END.size : table] if header.flags & _EXTENDED else b""
-    return _splats(parts, header, _axes(records, header, path))
+    return _decode_splats(parts, header, _read_axes(records, header, path))
 
 
 def _read_gzip(content: bytes, path: str | os.PathLike) -> Splats:
+    """Read a file of version 1 to 3: one gzip stream of header and tables. path: for messages."""
     stream = gzip.GzipFile(fileobj=io.BytesIO(content))
-    header = _header(stream.read(_HEADER.size), (1, 2, 3), len(content))
+    header = _read_header(stream.read(_HEADER.size), (1, 2, 3), len(content))
     # No more than that, however much is packed.
-    parts = [stream.read(width * header.count) for width in _widths(header)]
+    parts = [stream.read(width * header.count) for width in _list_widths(header)]
     records = stream.read(_MOST_RECORDS) if header.flags & _EXTENDED else b""
     if stream.read(1):  # at the end it checks the sum
         raise ValueError("it holds more than its header says")
-    return _splats(parts, header, _axes(records, header, path))
+    return _decode_splats(parts, header, _read_axes(records, header, path))
 
 
-def _splats(parts: list[bytes], header: _Header, axes: str) -> Splats:
+def _decode_splats(parts: list[bytes], header: _Header, axes: str) -> Splats:
+    """Decode the tables of a file into splats.
+
+    parts: bytes of each table, in the order of `_list_widths`. axes: "RUB", or the names of other axes of the file.
+    """
     count, degree = header.count, header.degree
     tables = [
-        np.frombuffer(part, np.uint8).reshape(count, width) for part, width in zip(parts, _widths(header), strict=True)
+        np.frombuffer(part, np.uint8).reshape(count, width)
+        for part, width in zip(parts, _list_widths(header), strict=True)
     ]
     positions, alpha, color, scales, rotations, rest = tables
     rest = rest.reshape(count, (degree + 1) ** 2 - 1, 3)[:, :15].astype(np.float32)

@@ -29,7 +29,7 @@ def read_trained(path: str | os.PathLike) -> Splats:
     content = content if isinstance(content, dict) else {}
     program, part = ("gsplat", "splats") if "splats" in content else ("nerfstudio", "pipeline")
     try:
-        values = _named(content[part])
+        values = _read_values(content[part])
     except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise UserError(f"{path} is a checkpoint without Gaussians of gsplat or nerfstudio; {remedy}") from error
     note_once(f"{path} is of {program}: it fits the cameras of a scene if its training did not normalize the world")
@@ -44,7 +44,7 @@ def read_trained(path: str | os.PathLike) -> Splats:
     return Splats(*(x.contiguous().numpy() for x in parts))
 
 
-def _named(found: Mapping[Any, Any]) -> dict[str, Tensor]:
+def _read_values(found: Mapping[Any, Any]) -> dict[str, Tensor]:
     """The raw values by gsplat's names, float32. KeyError and others for what is no Gaussians."""
     short = {str(name).removeprefix("_model.").removeprefix("gauss_params."): x for name, x in found.items()}
     short = {_OTHERS.get(name, name): x for name, x in short.items()}

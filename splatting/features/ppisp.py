@@ -17,7 +17,7 @@ from scene.gaussian_model import GaussianModel
 from scene.images.exposures import EXPOSURES
 from scene.images.exposures import exposures as by_points
 from scene.readers.info import CameraInfo, names_of_photos
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 from scene.scene import Scene
 from splatting.features.ppisp_appearance import UNTRAINED, PhotoAppearance, appearance_of, read_appearance
 from splatting.iteration import Iteration, Term
@@ -78,7 +78,7 @@ class Ppisp(Appearance):
         return {FITTED: (fitted_views(photos, pipe, background), scene.getTestCameras())}
 
     @staticmethod
-    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+    def advise(scene: Scene, tracks: Sequence[PhotoPoints | None]) -> Iterator[Finding]:
         """Measure how far the exposures of the photos differ."""
         if any(tracks):
             cameras = sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)
@@ -105,7 +105,7 @@ def fitted_views(photos: PhotoAppearance, pipe: argparse.Namespace, background: 
     return ScoredViews(pipe, background, True, draw)
 
 
-def exposures(cameras: list[Camera], tracks: list[Track | None]) -> np.ndarray:
+def exposures(cameras: list[Camera], tracks: list[PhotoPoints | None]) -> np.ndarray:
     """Return the exposures (K,) of the photos that have a track, in stops around their mean."""
     colors, points = [], []
     for track, camera in zip(tracks, cameras, strict=True):

@@ -14,7 +14,7 @@ from groundwork.finding import Finding, note
 from scene.cameras import Camera
 from scene.checks.fit import pose_errors, poses_differ
 from scene.readers.info import CameraInfo, SceneInfo
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 from scene.scene import Scene
 from splatting.features.refine_poses_steps import PoseRefinement
 from splatting.part import Needs, Part, Scored
@@ -65,7 +65,7 @@ class RefinePoses(Part):
         write_poses(scene.model_path, scene.getTrainCameras(), scene.getTestCameras())
 
     @staticmethod
-    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+    def advise(scene: Scene, tracks: Sequence[PhotoPoints | None]) -> Iterator[Finding]:
         """Measure whether the tracks suggest other poses."""
         found = pose_errors(scene.info.train_cameras, tracks, scene.cameras_extent) if any(tracks) else None
         if found is not None:

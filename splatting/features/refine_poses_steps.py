@@ -14,8 +14,8 @@ import torch
 from groundwork.ranks.ranks import ranks
 from scene.cameras import Camera
 from scene.readers.info import places
-from scene.readers.tracks import Track, read_tracks
-from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
+from scene.readers.tracks import PhotoPoints, read_tracks
+from scene.reprojection import BOUND, moved_pose, nearest_pose, pose_loss, twist_gradient
 from scene.scene import Scene
 from splatting.records.training_log import DEGREES, PERCENT
 from utils.general_utils import get_expon_lr_func
@@ -195,18 +195,18 @@ class TrackedPoses:
     """
 
     def __init__(
-        self, given: Sequence[np.ndarray], tracks: Sequence[Track | None], focals: Sequence[float], unit: float
+        self, given: Sequence[np.ndarray], tracks: Sequence[PhotoPoints | None], focals: Sequence[float], unit: float
     ) -> None:
         """Find the poses.
 
         given: the dataset's poses.
-        tracks, focals, unit: as for `pull` (scene/reprojection.py).
+        tracks, focals, unit: as for `pose_loss` (scene/reprojection.py).
         """
         self.starts, self.held = [], []
         for pose, track, focal in zip(given, tracks, focals, strict=True):
             start = nearest_pose(pose, track, focal, unit, BOUND)
             self.starts.append(start)
-            self.held.append(track and pull(start, track, focal, unit).curvature)
+            self.held.append(track and pose_loss(start, track, focal, unit).curvature)
 
     def pulled(self, view: int, twist: np.ndarray) -> np.ndarray | None:
         """Return the gradient of a view's error at a twist; None if the view is not held."""

@@ -7,7 +7,7 @@ from typing import Any
 from torch import Tensor
 
 from groundwork.finding import Finding, note
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 from scene.scene import Scene
 from splatting.features.sky_shell import FEWEST, Shell, find_sky, resumed_shell, said_of_sky, with_shell
 from splatting.iteration import Iteration, Term
@@ -57,7 +57,7 @@ class Sky(Part):
         return {self.name: self.shell.captured()}
 
     @staticmethod
-    def advise(scene: Scene, tracks: Sequence[Track | None]) -> Iterator[Finding]:
+    def advise(scene: Scene, tracks: Sequence[PhotoPoints | None]) -> Iterator[Finding]:
         """Measure whether the photos show a sky."""
         if len(scene.info.point_cloud.points):
             _, share = find_sky(scene, Shell.around(scene.info))

@@ -218,8 +218,8 @@ def test_maps_are_found_below_their_folder_and_a_photo_is_no_map(tmp_path, prefi
     if place == "{}.png":
         (tmp_path / "sparse" / "0").mkdir(parents=True)
         model = SimpleNamespace(images=[SimpleNamespace(name=camera.image_name) for camera in cameras])
-        assert depth_scale._maps(tmp_path, tmp_path / "depths", model, None) == found
-        assert depth_scale._maps(tmp_path, tmp_path / "images", model, None) == [None, None]
+        assert depth_scale._find_maps(tmp_path, tmp_path / "depths", model, None) == found
+        assert depth_scale._find_maps(tmp_path, tmp_path / "images", model, None) == [None, None]
 
 
 @pytest.mark.parametrize(("metric", "empty"), [*((True, one) for one in (0, -2, np.nan, -np.inf, 1e-310)), (False, 0)])

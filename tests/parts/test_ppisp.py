@@ -21,7 +21,7 @@ from applications.evaluation.plan import Run, SceneEntry
 from applications.evaluation.results import read_run
 from gaussian_renderer.scored_views import has_trained_exposure
 from scene.gaussian_model import GaussianModel
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 from scene.saved_model import load_saved
 from scene.scene import Scene
 from splatting.features.ppisp import exposures
@@ -247,11 +247,11 @@ def test_test_views_may_have_the_names_of_training_photos(tmp_path):
     assert seen == {"train": [True] * 4, "test": [False] * 2}
 
 
-def _track(points: np.ndarray, ranks: np.ndarray) -> Track:
+def _track(points: np.ndarray, ranks: np.ndarray) -> PhotoPoints:
     """A track of points that lie at the pixel of their rank."""
     places = (np.stack([ranks % SIDE, ranks // SIDE], axis=1) + 0.5) / SIDE
     ones = np.ones(len(ranks))
-    return Track(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
+    return PhotoPoints(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
 
 
 def _camera(image: np.ndarray) -> SimpleNamespace:

@@ -26,8 +26,8 @@ from scene.dataset_readers import SceneInfo
 from scene.gaussian_model import GaussianModel
 from scene.poses import moved
 from scene.readers.colmap import read_colmap
-from scene.readers.tracks import Track, rays_to, read_tracks
-from scene.reprojection import BOUND, moved_pose, nearest_pose, pull, twist_gradient
+from scene.readers.tracks import PhotoPoints, rays_to, read_tracks
+from scene.reprojection import BOUND, moved_pose, nearest_pose, pose_loss, twist_gradient
 from scene.scene import Scene
 from splatting.features import refine_poses_steps as refinement
 from splatting.features.refine_poses import NAME, with_poses
@@ -51,15 +51,15 @@ def _errors(found: list, right: SceneInfo) -> list[float]:
     return np.mean(apart, axis=0).tolist()
 
 
-def _track(count: int = 60, noise: float = 0.0) -> Track:
+def _track(count: int = 60, noise: float = 0.0) -> PhotoPoints:
     rng = np.random.default_rng(1)
     points = rng.normal(size=(count, 3))
     view = points @ POSE[:3, :3].T + POSE[:3, 3]
     rays = view[:, :2] / view[:, 2:] + noise * rng.normal(size=(count, 2))
-    return Track(points, rays, rays, *np.ones((3, count)))
+    return PhotoPoints(points, rays, rays, *np.ones((3, count)))
 
 
-def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> Track:
+def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> PhotoPoints:
     """Return the track of a fisheye that sees points up to so many degrees from its axis.
 
     noise: radians.
@@ -70,7 +70,7 @@ def _wide_track(count: int = 60, noise: float = 0.0, degrees: float = 120.0) -> 
     view = np.column_stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)])
     points = (rng.uniform(2, 5, (count, 1)) * view - POSE[:3, 3]) @ POSE[:3, :3]
     rays += noise * rng.normal(size=rays.shape)
-    return Track(points, rays, rays, *np.ones((3, count)), angular=True)
+    return PhotoPoints(points, rays, rays, *np.ones((3, count)), angular=True)
 
 
 @pytest.mark.parametrize("degrees", [60.0, 92.0])
@@ -86,11 +86,13 @@ def test_fisheyes_find_a_pose_as_well_as_noise_allows(degrees):
 def test_the_gradient_and_the_matrix_of_a_pull(track):
     step = 1e-5  # errors of about a pixel, on both sides of the outliers' limit
     pose = moved_pose(POSE, 0.1 * TURN, 2.0)
-    at = pull(pose, track, 90.0, 2.0)
-    ends = [[pull(moved_pose(pose, side * step * one, 2.0), track, 90.0, 2.0) for side in (1, -1)] for one in np.eye(6)]
+    at = pose_loss(pose, track, 90.0, 2.0)
+    ends = [
+        [pose_loss(moved_pose(pose, side * step * one, 2.0), track, 90.0, 2.0) for side in (1, -1)] for one in np.eye(6)
+    ]
     np.testing.assert_allclose(at.gradient, [(a.loss - b.loss) / (2 * step) for a, b in ends], rtol=1e-6, atol=1e-6)
-    inliers = pull(pose, track, 0.9, 2.0)  # all errors are small
-    exact = pull(POSE, _wide_track() if track.angular else _track(), 0.9, 2.0)
+    inliers = pose_loss(pose, track, 0.9, 2.0)  # all errors are small
+    exact = pose_loss(POSE, _wide_track() if track.angular else _track(), 0.9, 2.0)
     assert exact.loss < 1e-25 and np.abs(exact.gradient).max() < 1e-12
     assert np.linalg.eigvalsh(inliers.curvature).min() > 0
 
@@ -155,7 +157,7 @@ def test_what_no_track_can_have_is_left_out(of, value, tmp_path, capsys):
     assert f"{lost} 2D points of {tmp_path / 'sparse/0'} are not used: " in capsys.readouterr().err
 
 
-def _tracks(scene: Path, views: list) -> list[Track]:
+def _tracks(scene: Path, views: list) -> list[PhotoPoints]:
     return read_tracks(scene, views, np.zeros(3))
 
 

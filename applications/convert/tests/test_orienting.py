@@ -14,7 +14,7 @@ from applications.convert.layout import Layout
 from applications.convert.orienting import describe_orientation, orient_scene
 from gaussian_renderer.camera_paths.poses import look_along
 from groundwork.files.similarity import Similarity, read_orientation
-from scene.images.exif import _gps, read_place
+from scene.images.exif import _read_gps, read_place
 
 TILT = Rotation.from_rotvec([0.5, 1.3, -0.4]).as_matrix()  # from the level frame (x east, y down, z north) to the world
 UNIT = 0.04  # scene units in a metre
@@ -241,5 +241,5 @@ def test_drones_tell_place_and_gravity_in_xmp(tmp_path, spelling, longitude, pit
     ({1: "N", 2: (), 3: "E", 4: (1.0, 2.0, 3.0, 4.0)}, None),
 ])  # fmt: skip
 def test_gps_as_programs_write_it(tags, place):
-    found = _gps(tags)
+    found = _read_gps(tags)
     assert found is None if place is None else found == pytest.approx(place, nan_ok=True)

@@ -20,7 +20,7 @@ from applications.doctor.model import check_training
 from arguments import OptimizationParams
 from groundwork.files.json_files import write_json
 from groundwork.finding import Severity, note
-from scene.readers.tracks import Track
+from scene.readers.tracks import PhotoPoints
 from splatting.checks import check_overfitting
 from splatting.records.error_curve import COLUMNS, NAME, Row, write_curve
 from splatting.records.training_log import NAME as LOG
@@ -29,11 +29,11 @@ from utils.system_utils import UserError
 SIDE = 20
 
 
-def _track(points: np.ndarray, ranks: np.ndarray) -> Track:
+def _track(points: np.ndarray, ranks: np.ndarray) -> PhotoPoints:
     """A track of points that lie at the pixel of their rank."""
     places = (np.stack([ranks % SIDE, ranks // SIDE], axis=1) + 0.5) / SIDE
     ones = np.ones(len(ranks))
-    return Track(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
+    return PhotoPoints(points, np.zeros((len(ranks), 2)), places, ones, ones, ranks)
 
 
 def test_photos_of_a_point_from_twice_as_far_have_twice_the_depth_in_focal_lengths():

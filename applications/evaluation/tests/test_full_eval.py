@@ -469,7 +469,7 @@ def test_names_stay_names_in_the_report(figures, evaluate):
 
 def test_each_test_view_has_photo_render_and_error_in_the_page(evaluate, monkeypatch):
     (attic,) = evaluate("attic")["runs"]
-    html = evaluate.text("html").replace(lpips_utils._url("vgg"), "the address of LPIPS's weights", 1)
+    html = evaluate.text("html").replace(lpips_utils._find_url("vgg"), "the address of LPIPS's weights", 1)
     assert "http:" not in html and "https:" not in html  # needs nothing else
     assert "the address of LPIPS's weights into a folder, and repeat the command with --weights FOLDER" in html
     captions = re.findall("<figcaption>(.*?)</figcaption>", html)
