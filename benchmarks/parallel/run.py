@@ -48,7 +48,7 @@ class WorkloadRun(Run):
         scene.getTrainCameras = lambda: cameras
         if gpu_memory:
             gaussians.storage = make_storage(gaussians, opt, device, absolute=False)
-            gaussians.storage.reserve(-(-workload.gaussians // group.size), scene)
+            gaussians.storage.limit_for(-(-workload.gaussians // group.size), scene)
         made = Schedule(opt.iterations), scene, gaussians, ViewOrder(cameras, opt.seed)
         super().__init__(dataset, opt, pipe, launch, group, device, None, 0, [], *made)
         self._begin(workload)
