@@ -22,10 +22,11 @@ NEWEST_TORCH = (2, 13)  # that was tried
 EXTENSIONS = ("diff-gaussian-rasterization", "fused-ssim", "simple-knn")
 
 
-def requirements() -> list[str]:
-    """Read requirements.txt. If torch is installed, do not pin torch and torchvision, so that it stays.
+def read_requirements() -> list[str]:
+    """Return the lines of requirements.txt; where torch is installed, with a range of its versions in place of the pin.
 
-    A wheel made with a torch that was tried takes no newer one than those.
+    So pip keeps the torch that is there. The range begins with OLDEST_TORCH and ends with NEWEST_TORCH, or has no end
+    if the installed torch is newer. torchvision may then have any version.
     """
     lines = (ROOT / "requirements.txt").read_text(encoding="utf-8").splitlines()
     lines = [line for line in lines if line and not line.startswith("#")]
@@ -61,6 +62,6 @@ setup(
         "video": ["imageio-ffmpeg==0.8.1"],  # convert.py --video, render.py --path
         "viewer": ["viser==1.1.1"],  # view.py, train.py --viewer
     },
-    install_requires=requirements(),
+    install_requires=read_requirements(),
     **extension_options({name.replace("-", "_"): ROOT / "submodules" / name for name in EXTENSIONS}),
 )

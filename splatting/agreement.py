@@ -23,7 +23,7 @@ def agree_on_options(args: argparse.Namespace) -> None:
     """Raise UserError if a rank has other code or options than rank 0."""
     if not ranks().several:
         return
-    refuse_differences(ranks().all_gather_objects(_code()), "give all ranks the same files", shown=False)
+    refuse_differences(ranks().all_gather_objects(_digest_code()), "give all ranks the same files", shown=False)
     options = {f"--{name}": str(value) for name, value in vars(args).items()}
     refuse_differences(ranks().all_gather_objects(options), "start all ranks with the same command")
 
@@ -35,13 +35,16 @@ def agree_on_scene(scene: Scene, start: str | None) -> None:
     """
     if not ranks().several:
         return
-    facts = {"the training views": _digest(scene.getTrainCameras()), "the test views": _digest(scene.getTestCameras())}
+    facts = {
+        "the training views": _digest_cameras(scene.getTrainCameras()),
+        "the test views": _digest_cameras(scene.getTestCameras()),
+    }
     if start:
         facts[start] = hashlib.sha256(Path(start).read_bytes()).hexdigest()
     refuse_differences(ranks().all_gather_objects(facts), "give all ranks the same dataset", shown=False)
 
 
-def _code() -> dict[str, str]:
+def _digest_code() -> dict[str, str]:
     """Return digests of the Python files that take part, by path, and of the extensions' binaries, by name."""
     paths = [_ROOT / "train.py", *(path for room in _ROOMS for path in (_ROOT / room).rglob("*.py"))]
     found = {str(path.relative_to(_ROOT)): path for path in sorted(paths)}
@@ -52,7 +55,7 @@ def _code() -> dict[str, str]:
     return {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in found.items()}
 
 
-def _digest(cameras: Sequence[Camera]) -> str:
+def _digest_cameras(cameras: Sequence[Camera]) -> str:
     """Return a digest of cameras: names, sizes, lenses, matrices, and kinds of image files (photo, mask, depth map)."""
     digest = hashlib.sha256()
     for camera in cameras:

@@ -16,6 +16,7 @@ class Curve(Part):
     """Scores test views, and as many training views, in planned iterations, and draws the curve at the end."""
 
     def __init__(self, run: Any) -> None:
+        """Make the recorder: it scores the test views, and as many training views that train in whole."""
         self._run, test = run, run.scene.getTestCameras()
         trained = [camera for camera in run.scene.getTrainCameras() if camera.columns is None]  # in whole
         views = ScoredViews(run.pipe, run.background, run.scene.halves)
@@ -46,6 +47,7 @@ class Curve(Part):
         return self._due
 
     def measured(self, at: Iteration, losses: Losses) -> None:
+        """Score the views and add a point to the curve, in a planned iteration and in the last one."""
         if self._due or at.last:
             self._seconds = at.scored_at = self._run.clock.seconds
             point = self._recorder.point(at.span) or at.span[-1]
@@ -53,6 +55,7 @@ class Curve(Part):
                 self._recorder.add(point, self._seconds, self._run.gaussians.gaussian_count, at.iteration)
 
     def ended(self, error: Error) -> None:
+        """Wait for the figure, and advise on the best iteration. After an error, end the process that draws."""
         if error is not None:
             self._recorder.abandon()
             return

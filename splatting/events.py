@@ -61,6 +61,7 @@ class LossEvents(Part):
         self._kept: list[tuple] = []
 
     def measured(self, at: Iteration, losses: Losses) -> None:
+        """Keep the losses of every tenth iteration, and write the kept ones once an iteration is due."""
         if at.iteration % INTERVAL == 0 and not at.takes(self._run.launch.test_iterations):
             self._kept.append((at.iteration, losses.l1, losses.total, self._run.clock.seconds - at.started))
         if at.due and self._kept:
@@ -86,18 +87,19 @@ class EventWriter:
         from torch.utils.tensorboard import SummaryWriter  # takes 0.3 s to import
 
         self._folder, self._failed = log_dir, False
-        self._writer = self._guarded(SummaryWriter, log_dir, flush_secs=_FLUSHED)
+        self._writer = self._call_safely(SummaryWriter, log_dir, flush_secs=_FLUSHED)
 
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
             raise AttributeError(name)
-        return partial(self._guarded, getattr(self._writer, name, None))
+        return partial(self._call_safely, getattr(self._writer, name, None))
 
     def add_image(self, tag: str, image: Tensor, global_step: int) -> None:
         """Add an image (3, H, W), from 0 to 1, as a JPEG: a training took 8 s for PNGs and their checksums."""
-        self._guarded(self._add_jpeg, tag, image, global_step)
+        self._call_safely(self._add_jpeg, tag, image, global_step)
 
     def _add_jpeg(self, tag: str, image: Tensor, step: int) -> None:
+        """Add an image (3, H, W), from 0 to 1, to the file of events as a JPEG."""
         from PIL import Image
         from tensorboard.compat.proto.summary_pb2 import Summary
 
@@ -109,7 +111,8 @@ class EventWriter:
         picture = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=jpeg.getvalue())
         self._writer.file_writer.add_summary(Summary(value=[Summary.Value(tag=tag, image=picture)]), step)
 
-    def _guarded(self, method: Callable[..., Any], *given: Any, **named: Any) -> Any:
+    def _call_safely(self, method: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        """Call a method of the writer. The first failure becomes a warning; after it, calls do nothing."""
         from tqdm import tqdm
 
         if self._failed:

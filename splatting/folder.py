@@ -67,19 +67,19 @@ def records_kept(model_path: str) -> Iterator[None]:
     ranks does this for all.
     """
     folder = Path(model_path)
-    saves = _stamps(folder) if ranks().first else {}
+    saves = _read_stamps(folder) if ranks().first else {}
     kept = {name: (folder / name).read_bytes() for name in _RECORDS if saves and (folder / name).is_file()}
     try:
         yield
     except BaseException:
-        if kept and _stamps(folder) == saves:
+        if kept and _read_stamps(folder) == saves:
             for name, content in kept.items():
                 with atomic_write(folder / name) as temporary:
                     temporary.write_bytes(content)
         raise
 
 
-def _stamps(folder: Path) -> dict[Path, int]:
+def _read_stamps(folder: Path) -> dict[Path, int]:
     return {path: path.stat().st_mtime_ns for path in saves_in(folder).values()}
 
 
@@ -156,7 +156,7 @@ def check_folder(
     now: all options.
     """
     folder = Path(now.model_path)
-    saved, then = saves_in(folder), _options_of(folder)
+    saved, then = saves_in(folder), _read_options(folder)
     trained_on = str(then.get("source_path", ""))
     if not lies_in(checkpoint, folder) and saved and other_scene(trained_on, now.source_path):
         raise UserError(
@@ -167,9 +167,9 @@ def check_folder(
     if not stay:
         return
     kept = f"{folder} keeps iteration {', '.join(map(str, sorted(stay)))} of an earlier training"
-    changed = [name for name in _changed(then, now) if name in VIEW_OPTIONS]
+    changed = [name for name in _list_changed(then, now) if name in VIEW_OPTIONS]
     if changed and max(stay) > max(saving_iterations, default=0):
-        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        before, after = (" ".join(_format_option(n, of[n]) for n in changed) for of in (then, vars(now)))
         raise UserError(
             f"{kept} with {before}, and this one has {after}; name another folder by -m, or remove the old one"
         )
@@ -197,7 +197,7 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
     grown: true if the scene is the same, with more photos.
     """
     folder = Path(checkpoint).parent
-    then = _options_of(folder)
+    then = _read_options(folder)
     trained_on = str(then.get("source_path", ""))
     if not grown and other_scene(trained_on, now.source_path):
         raise UserError(
@@ -210,10 +210,10 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
         gone["resolution_schedule"] = "pyramid"
     if gone:
         raise UserError(
-            f"{checkpoint} was trained with {_typed(*min(gone.items()))}, which this code does not have; use the code "
-            "that wrote it, or start a new training from its PLY by --init_ply"
+            f"{checkpoint} was trained with {_format_option(*min(gone.items()))}, which this code does not have; use "
+            "the code that wrote it, or start a new training from its PLY by --init_ply"
         )
-    changed = _changed(then, now)
+    changed = _list_changed(then, now)
     if "eval" in changed and now.eval:
         raise UserError(
             f"{checkpoint} was trained on all photos, so --eval has no unseen photos to hold out; leave --eval out, or "
@@ -221,11 +221,11 @@ def report_changes(checkpoint: str, now: argparse.Namespace, grown: bool = False
         )
     if "holdout" in changed and now.eval:
         raise UserError(
-            f"{checkpoint} was trained with {_typed('holdout', then['holdout'])}, so it has seen photos that "
-            f"{_typed('holdout', now.holdout)} holds out; give the former, or start a new training"
+            f"{checkpoint} was trained with {_format_option('holdout', then['holdout'])}, so it has seen photos that "
+            f"{_format_option('holdout', now.holdout)} holds out; give the former, or start a new training"
         )
     if changed:
-        before, after = (" ".join(_typed(n, of[n]) for n in changed) for of in (then, vars(now)))
+        before, after = (" ".join(_format_option(n, of[n]) for n in changed) for of in (then, vars(now)))
         mixed = VIEW_OPTIONS.intersection(changed) and (folder / CURVE).exists()
         of_curve = "; the earlier points of its curve are of those other views" if mixed else ""
         _warn(f"{folder} was trained with {before}, this run has {after}{of_curve}")
@@ -254,7 +254,7 @@ def continue_records(model_path: str, checkpoint: str | None, first_iteration: i
 
 def strategy_of(checkpoint: str) -> str:
     """Return the strategy of the run that wrote a checkpoint; adc if its folder does not say."""
-    return str(_options_of(Path(checkpoint).parent).get("strategy", "adc"))
+    return str(_read_options(Path(checkpoint).parent).get("strategy", "adc"))
 
 
 def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argparse.Namespace:
@@ -263,7 +263,7 @@ def resolve_lenses(dataset: argparse.Namespace, checkpoint: str | None) -> argpa
     A folder that records no value is of a time when photos were undistorted; auto then stays, and means the same.
     UserError for other photos than those of that run.
     """
-    given, then = getattr(dataset, "lenses", None), _options_of(Path(checkpoint).parent) if checkpoint else {}
+    given, then = getattr(dataset, "lenses", None), _read_options(Path(checkpoint).parent) if checkpoint else {}
     before = then.get("lenses", "auto") if checkpoint else "native"
     if given == "auto":
         dataset = copy.copy(dataset)
@@ -283,14 +283,14 @@ def enlargement_of(checkpoint: str | None, otherwise: float) -> float:
     return record.get(ENLARGEMENT, 1.0) if record else otherwise
 
 
-def _options_of(folder: Path) -> dict[str, object]:
+def _read_options(folder: Path) -> dict[str, object]:
     """Return the training options that a folder records; none if they cannot be read, as without a model."""
     with contextlib.suppress(UserError, OSError):
         return read_training_options(folder)
     return {}
 
 
-def _changed(then: dict[str, object], now: argparse.Namespace) -> list[str]:
+def _list_changed(then: dict[str, object], now: argparse.Namespace) -> list[str]:
     """Return the names of options that differ from those that an earlier training has recorded."""
     names = [option.name for option in OPTIONS if option.compared and option.name in then]
     return [name for name in names if not _equal(name, then[name], getattr(now, name))]
@@ -304,7 +304,7 @@ def _same_place(one: str | os.PathLike, other: str | os.PathLike) -> bool:
     return os.path.realpath(one) == os.path.realpath(other)
 
 
-def _typed(name: str, value: object) -> str:
+def _format_option(name: str, value: object) -> str:
     """Format an option as it is typed on a command line."""
     if isinstance(value, bool):
         return f"--{name}" if value else f"no --{name}"

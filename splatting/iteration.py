@@ -90,6 +90,10 @@ class ViewOrder:
     """Training cameras by iteration, counted from 1: each once per epoch, in an order drawn from seed and epoch."""
 
     def __init__(self, cameras: list[Camera], seed: int) -> None:
+        """Prepare the order. UserError without cameras.
+
+        seed: seed from which the order of each epoch is drawn.
+        """
         if not cameras:
             raise UserError("the scene has no training views; without --eval all views train")
         self.cameras = cameras
@@ -97,6 +101,7 @@ class ViewOrder:
         self._orders: dict[int, list[int]] = {}
 
     def __getitem__(self, iteration: int) -> Camera:
+        """Return the camera of an iteration, counted from 1."""
         epoch, position = divmod(iteration - 1, len(self.cameras))
         if epoch not in self._orders:
             # Two at most: prefetching at the end of an epoch alternates between it and the next.

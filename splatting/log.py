@@ -23,6 +23,7 @@ class ProgressBar(Part):
     """Shows running means of the loss and of the parts' terms, and prints at the end how long the training took."""
 
     def __init__(self, run: Run) -> None:
+        """Show a bar of the schedule's steps, those done before the run included."""
         self._run = run
         self._shown = {"Loss": run.losses}
         self._updated, self._done = -math.inf, run.first_iteration
@@ -36,6 +37,7 @@ class ProgressBar(Part):
         return False  # it reads losses, and not the model, whose blocks may sleep on
 
     def measured(self, at: Iteration, losses: Losses) -> None:
+        """Keep the losses, and show their means in an iteration that is due."""
         for name, term in losses.terms.items():
             self._shown.setdefault(f"{name.capitalize()} Loss", LossWatch()).add(at.iteration, term)
         if not at.due:
@@ -51,21 +53,22 @@ class ProgressBar(Part):
         self._updated, self._done = time.monotonic(), at.iteration
 
     def ended(self, error: Error) -> None:
+        """Close the bar and, without an error, print the number of iterations and their seconds."""
         self._bar.close()
         if error is not None:
             return
         run, seconds = self._run, self._run.clock.seconds
         if not run.schedule.by_clock:
             before = f", {run.log.seconds_before + seconds:.1f} s with those before" if run.first_iteration else ""
-            print(f"{_iterations(self._done - run.first_iteration)} in {seconds:.1f} s{before}")
+            print(f"{_format_iterations(self._done - run.first_iteration)} in {seconds:.1f} s{before}")
             return
         # With those before a resume, as the budget.
         seconds, whole = run.log.seconds_before + seconds, run.log.wall_seconds_before + wall_seconds()
         budget = f"budget {run.schedule.until:.4g} s, {whole:.1f} s with start, scores and saves"
-        run.log.tell(f"{_iterations(self._done)} in {seconds:.1f} s ({budget})")
+        run.log.tell(f"{_format_iterations(self._done)} in {seconds:.1f} s ({budget})")
 
 
-def _iterations(count: int) -> str:
+def _format_iterations(count: int) -> str:
     return f"{count:,} iteration{'s' if count != 1 else ''}"
 
 
@@ -84,6 +87,7 @@ class Summary(Part):
             self._psnr = scored[0] if scored else None
 
     def ended(self, error: Error) -> None:
+        """Print the model's score and the command that shows the model, unless an error ended the training."""
         if error is not None:
             return
         run = self._run
@@ -102,6 +106,7 @@ class Records(Part):
         self._seconds = 0.0
 
     def measured(self, at: Iteration, losses: Losses) -> None:
+        """Write the record of an iteration that other observers or the curve have put numbers into."""
         run = self._run
         if at.record is None and at.scored_at is None:
             return

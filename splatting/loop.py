@@ -1,4 +1,8 @@
-"""The training loop: an iteration from top to bottom, and the observers that run beside it."""
+"""The training loop: an iteration from top to bottom, and the observers that run beside it.
+
+A part is a class whose hooks add one feature to a training (splatting/part.py). An observer is a part that
+only watches.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -35,12 +39,12 @@ def plain_step(run: Run, at: Iteration, tell: "Announcer") -> None:
     gaussians, strategy, options = run.gaussians, run.strategy, run.render_options(at)
     _prepare_rows(run, at)  # all of them, unless blocks of rows sleep (scene/sleeping.py)
     package = render(at.camera, gaussians, run.pipe, at.background, **options)
-    planes = _planes(package, run)
+    planes = _keep_planes(package, run)
     if gaussians.exposures.applied:
         package["render"] = apply_trained_exposure(package["render"], at.camera, gaussians)
     losses = run.objective(package, at)  # (1 - lambda) L1 + lambda (1 - SSIM), and terms of parts
     losses.total.backward()
-    if _is_for_sleepers(run):
+    if _reaches_sleepers(run):
         _stop_skipping(run)
         return plain_step(run, at, tell)
     if planes and at.steps:
@@ -107,7 +111,7 @@ def training_steps(run: Run, observers: Sequence[Part]) -> Iterator[tuple[Iterat
 
 def standard_observers(run: Run) -> list[Part]:
     """Return the observers of every training, and among them, in their place, the parts of the run."""
-    last = _last_observers(run)  # which print, so that they are made before the progress bar
+    last = _last_observers(run)  # made before the progress bar, as they print when they are made
     if run.report is not training_report:
         run.stop_skipping()  # it may read or change the model in every iteration
     return [
@@ -127,14 +131,17 @@ def standard_observers(run: Run) -> list[Part]:
 
 
 def _last_observers(run: Run) -> list[Part]:
-    """Return the observers that may let the training wait, when all else of an iteration is done and written."""
+    """Return the observers that come last: checkpoints of --resume, then the viewers.
+
+    Viewers may pause the training, so all other work of an iteration is done and written before.
+    """
     last: list[Part] = [Resume(run)]
     if RemoteViewer.suits(run):
         last.append(RemoteViewer(run))
     if run.launch.viewer is not None:
         page = application("viewer", "training_page").TrainingPage(run)
         run.resources.callback(page.close)
-        last.append(page)  # its pause is of all else
+        last.append(page)  # at the end, so that a pause comes after all other work
     return last
 
 
@@ -142,9 +149,11 @@ class Announcer:
     """Calls the hooks of parts, in the order of the list. As a context manager, it passes an error on to `ended`."""
 
     def __init__(self, parts: Sequence[Part], flushed: Callable[[], AbstractContextManager] = nullcontext) -> None:
-        """Collect the hooks.
+        """Collect the hooks that the parts override.
 
-        flushed: context in which parts are called in an iteration in which they read the model.
+        parts: parts in the order in which their hooks are called.
+        flushed: returns the context in which hooks run if a part reads the model, such as `Run.flushed_view`, in which
+            no block of rows has a step to catch up on.
         """
         self._flushed = flushed
         self._due, self._measured, self._stepped, self._ended = (
@@ -182,7 +191,7 @@ class Announcer:
 # What a plain step does besides, where poses are trained or rows sleep
 
 
-def _planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
+def _keep_planes(package: dict[str, Tensor | None], run: Run) -> list[Tensor | None]:
     """Keep the gradients of image and depth before exposures, for the step of a camera; [] if no camera is trained."""
     if not run.camera_steps:
         return []
@@ -215,7 +224,7 @@ def _prepare_rows(run: Run, at: Iteration) -> None:
         run.gaussians.optimizer.rows = run.sleeping.rows()
 
 
-def _is_for_sleepers(run: Run) -> bool:
+def _reaches_sleepers(run: Run) -> bool:
     """Tell whether the loss depends on a row that sleeps, because somebody has added a term to the loss."""
     rows = run.sleeping and run.gaussians.optimizer.rows
     if rows is None:

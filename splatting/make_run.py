@@ -59,7 +59,7 @@ def make_run(
     gaussians.storage = make_storage(gaussians, opt, device, any(one.takes_absolute(opt) for one in strategies()))
     check_viewer(launch)
     if schedule.is_over(done):
-        raise UserError(schedule.nothing_left(start, done))
+        raise UserError(schedule.nothing_left_message(start, done))
 
     init_ply = None if start else getattr(dataset, "init_ply", None)
     scene, splats = scene_with(init_ply, dataset, gaussians, ranks=group, parts=parts)
@@ -69,7 +69,7 @@ def make_run(
     gaussians.divide(group)
     if gaussians.storage:
         rows = capture[1] if capture else scene.info.point_cloud.points if splats is None else splats
-        gaussians.storage.reserve(-(-len(rows) // group.size), scene)
+        gaussians.storage.limit_for(-(-len(rows) // group.size), scene)
     views = ViewOrder(scene.getTrainCameras(), opt.seed)
     run = Run(dataset, opt, pipe, launch, group, device, start, done, parts, schedule, scene, gaussians, views)
     run.decode_ahead(done + 1)
@@ -85,7 +85,7 @@ def make_run(
     run.warnings = [f"warning: {text}" for text in warnings_of(run, given)]
     for text in run.warnings:
         print(text, file=sys.stderr)
-    _place(run, states.get("sleep"))
+    _place_all(run, states.get("sleep"))
     warn_of_finished(run)
     run.watch, run.checkpoints = DivergenceWatch(run), Checkpoints(run)
     return run
@@ -150,7 +150,7 @@ def _begin_strategy(run: Run, states: dict[str, Any]) -> Strategy:
     return strategy
 
 
-def _place(run: Run, asleep: Any) -> None:
+def _place_all(run: Run, asleep: Any) -> None:
     """Put cameras where they are trained, rows where there is room for those to come, and blocks to sleep.
 
     asleep: state of the blocks in the checkpoint, or None.
@@ -159,7 +159,7 @@ def _place(run: Run, asleep: Any) -> None:
     if run.camera_steps:
         run.camera_steps.place()  # now that parts have measured where cameras were
     if storage:
-        storage.reserve(-(-strategy.max_gaussians // run.group.size), run.scene)
+        storage.limit_for(-(-strategy.max_gaussians // run.group.size), run.scene)
     dense = type(gaussians.optimizer) is GaussianAdam and FusedAdam.takes(gaussians)
     if not dense or strategy.queues or any(strategy.penalty) or not run.is_standard:
         return  # a step concerns rows that its view does not see

@@ -18,7 +18,7 @@ class Objective:
 
     Strategies decide whether renders are clamped to [0, 1] before the comparison (Strategy.clamps).
 
-    fusable: as for Strategy.
+    fusable: true if the loss needs gradients of image and depth alone, so that a fused step can take it.
     """
 
     fusable: ClassVar[bool] = True

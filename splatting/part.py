@@ -176,14 +176,14 @@ class Part:
 
         checkpoint: path of the checkpoint that is resumed, or None.
         first_iteration: iteration of the checkpoint, or 0.
-        state: as for `begin`.
+        state: the part's entry in the checkpoint; None without one.
         """
 
     def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
         """Return the dataset, with other views or points if need be.
 
         args: the model options.
-        fresh: true if the dataset is read for a new training.
+        fresh: true if the dataset is read to train, also from a checkpoint; false if it is for a saved model.
         """
         return info
 

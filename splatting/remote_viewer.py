@@ -35,6 +35,7 @@ class RemoteViewer(Part):
         return not (run.group.several or (run.launch.disable_viewer and network_gui.listener is None))
 
     def __init__(self, run: Any) -> None:
+        """Listen at --ip and --port, unless --disable_viewer is given."""
         self._run, self._gui = run, network_gui
         if not run.launch.disable_viewer:
             ip, port = FEATURES["remote_viewer"].launch[:2]
@@ -53,6 +54,7 @@ class RemoteViewer(Part):
                 self._serve(last=False)
 
     def ended(self, error: Error) -> None:
+        """Serve the viewer of a finished training until it leaves or lets go, and disconnect it."""
         if error is None:
             if self._gui.conn is None:
                 self._gui.try_connect()
@@ -78,13 +80,14 @@ class RemoteViewer(Part):
         """Answer one request. Return whether the viewer is still there."""
         try:
             request = self._gui.receive_request()
-            frame = None if request is None else self._frame(request)
+            frame = None if request is None else self._render_frame(request)
             self._gui.send(frame, self._run.dataset.source_path)
         except ViewerLost:
             return False
         return True
 
-    def _frame(self, request: Request) -> memoryview:
+    def _render_frame(self, request: Request) -> memoryview:
+        """Return the bytes of a requested frame. If it cannot be rendered, disconnect, and raise ViewerLost."""
         run = self._run
         try:
             return frame_bytes(request, run.gaussians, run.pipe, run.background)

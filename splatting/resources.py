@@ -41,7 +41,7 @@ def announce_memory(
 ) -> None:
     """Print the memory that photos and Gaussians need and what is free; warn, with a remedy, if they do not fit.
 
-    max_splats: as for `expected_count`.
+    max_splats: largest number of Gaussians, 0: any number.
     absolute: true with absolute gradients.
     size: number of processes that train together; each prints its own needs.
     """
@@ -61,7 +61,7 @@ def announce_memory(
     photos = f"photos {gib(pictures)}"
     if images.limit:
         photos += f" (--images_to_load keeps {images.limit:,} of {images.planned:,} decoded images)"
-    together = _keeps(images, device)
+    together = _keeps_photos(images, device)
     if not together:
         room = announce_device(images.keep_on, photos + each, pictures, pictures)
         if room < 0:
@@ -94,7 +94,7 @@ def announce_device(device: torch.device, content: str, pictures: int, needed: i
     if free is not None:
         free = limit if limit and device.type == "cuda" else free // sharing
     if free is None or needed > LITTLE * free:
-        print(f"{_name(device)} memory: about {gib(needed)} of {'?' if free is None else gib(free)}: {content}")
+        print(f"{_device_word(device)} memory: about {gib(needed)} of {'?' if free is None else gib(free)}: {content}")
     return math.inf if free is None else free - pictures
 
 
@@ -104,10 +104,10 @@ def warn_of(device: torch.device, what: str, remedy: str) -> None:
     what: what does not fit.
     remedy: what to set.
     """
-    print(f"warning: the memory of the {_name(device)} seems too small for {what}; {remedy}", file=sys.stderr)
+    print(f"warning: the memory of the {_device_word(device)} seems too small for {what}; {remedy}", file=sys.stderr)
 
 
-def _name(device: torch.device) -> str:
+def _device_word(device: torch.device) -> str:
     return "GPU" if device.type == "cuda" else "CPU"
 
 
@@ -124,7 +124,7 @@ def training_bytes(gaussians: GaussianModel, count: int, pixels: int, absolute: 
 
 def photo_bytes(images: ImageStore, device: torch.device) -> int:
     """Return the bytes of the photos that a device keeps."""
-    return images.planned_bytes if _keeps(images, device) else 0
+    return images.planned_bytes if _keeps_photos(images, device) else 0
 
 
 def largest_view(scene: Scene) -> int:
@@ -132,7 +132,7 @@ def largest_view(scene: Scene) -> int:
     return max(camera.image_width * camera.image_height for camera in scene.getTrainCameras())
 
 
-def _keeps(images: ImageStore, device: torch.device) -> bool:
+def _keeps_photos(images: ImageStore, device: torch.device) -> bool:
     return images.keep_on.type == device.type and (images.keep_on.index or 0) == (device.index or 0)
 
 

@@ -38,6 +38,7 @@ class Resume(Part):
     """Writes checkpoints from time to time (--resume), leaves one at the end, and notes that the end was reached."""
 
     def __init__(self, run: Any) -> None:
+        """Remove the checkpoint that an earlier training wrote from time to time, where a new one begins."""
         self._run, self._file = run, Path(run.scene.model_path) / REPLACED
         self._before = self._spent = 0.0  # seconds of training at the last checkpoint, seconds of writing so far
         self._speed = _SPEED
@@ -49,22 +50,23 @@ class Resume(Part):
         launch = self._run.launch
         asked = launch.resume and not at.last and at.iteration % EVERY == 0
         self._is_due = asked and self._run.group.broadcast_object(self._has_time())
-        return self._is_due or self._leaves(at)
+        return self._is_due or self._leaves_checkpoint(at)
 
     def _has_time(self) -> bool:
         seconds = self._run.clock.seconds
         wanted = self._spent + _BYTES * self._run.gaussians.gaussian_count / self._speed
         return seconds >= self._before + LEAST and wanted <= SHARE * seconds
 
-    def _leaves(self, at: Iteration) -> bool:
+    def _leaves_checkpoint(self, at: Iteration) -> bool:
         """Tell whether the iteration is the last one, and leaves a checkpoint."""
         launch = self._run.launch
         return at.last and not launch.no_last_checkpoint and not at.takes(launch.checkpoint_iterations)
 
     def stepped(self, at: Iteration) -> None:
+        """Write the checkpoint that is due or the last one, and measure how fast the disk is."""
         if at.stopping:
             return
-        if self._leaves(at):
+        if self._leaves_checkpoint(at):
             self._save(at)
         elif self._is_due:
             begun = time.monotonic()
@@ -74,9 +76,9 @@ class Resume(Part):
             self._speed = _BYTES * self._run.gaussians.gaussian_count / taken
             self._before = self._run.clock.seconds
         if at.last:
-            self._tell(Path(self._run.scene.model_path) / f"chkpnt{at.iteration}.pth")
+            self._print_checkpoint(Path(self._run.scene.model_path) / f"chkpnt{at.iteration}.pth")
 
-    def _tell(self, last: Path) -> None:
+    def _print_checkpoint(self, last: Path) -> None:
         if self._run.group.first and last.is_file():
             tqdm.write(checkpoint_line(last, self._run.schedule.more), file=sys.stdout)
 
@@ -98,7 +100,7 @@ class Resume(Part):
 def warn_of_finished(run: Any) -> None:
     """Warn that a training replaces a finished one in its folder, once nothing can refuse it."""
     folder = run.dataset.model_path
-    if run.start is None and run.group.first and (there := finished(folder)):
+    if run.start is None and run.group.first and (there := read_end(folder)):
         instead = f"; --resume with {there.more} would continue it" if there.checkpoint.is_file() else ""
         print(
             f"warning: {folder} has a finished training of {there.iteration:,} iterations, and this one starts "
@@ -122,9 +124,9 @@ def choose_checkpoint(
     if not folder:
         raise UserError("--resume needs -m, the folder whose training it resumes or starts")
     asked = next((further for name, further in stops.items() if getattr(opt, name)), None)  # None: by --iterations
-    if end := finished(folder):
+    if end := read_end(folder):
         launch.start_checkpoint = str(end.checkpoint)
-        return _continued(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
+        return _may_continue(folder, end, end.iteration < opt.iterations if asked is None else asked, asked is None)
     most = opt.iterations if asked is None else math.inf
     launch.start_checkpoint = newest_checkpoint(folder, most, since=0) or launch.start_checkpoint
     if not launch.start_checkpoint and saves_in(Path(folder)) and not read_model_json(folder):
@@ -140,8 +142,8 @@ class End(NamedTuple):
     checkpoint: Path
 
 
-def finished(folder: str | os.PathLike) -> End | None:
-    """Return the end of the training in a model folder; None if the training has not reached it.
+def read_end(folder: str | os.PathLike) -> End | None:
+    """Read the end of the training in a model folder; None if the training has not reached it.
 
     The checkpoint may not exist.
     """
@@ -167,7 +169,7 @@ def checkpoint_line(path: Path, more: str) -> str:
     return f"Last checkpoint: {shlex.quote(str(path))} ({size}); --resume with {more} continues this training"
 
 
-def _continued(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
+def _may_continue(folder: str, end: End, asked: bool, by_iterations: bool) -> bool:
     """Tell whether to continue a folder's finished training. UserError if it is impossible, or not by --iterations."""
     there = f"{folder} has a finished training of {end.iteration:,} iterations"
     wrong = by_iterations and end.more != STEADY.more

@@ -25,6 +25,13 @@ class NewFirst(ViewOrder):
     """
 
     def __init__(self, every: ViewOrder, since: int, until: int, names: list[str]) -> None:
+        """Divide the views into new and old ones, which take turns in the span.
+
+        every: order of all training views, which counts outside of the span.
+        since: last iteration before the span.
+        until: last iteration of the span.
+        names: image names of the new photos.
+        """
         super().__init__(every.cameras, every.seed)
         new = {*names}
         sides = [[view for view in every.cameras if (view.image_name in new) is side] for side in (True, False)]
@@ -49,10 +56,10 @@ def order_views(run: Any, record: Any) -> None:
         run.has_new_photos = True
     run.added_photos = added or record
     if run.added_photos is not None:
-        run.views = restored(run.views, run.added_photos)
+        run.views = restore_order(run.views, run.added_photos)
 
 
-def restored(every: ViewOrder, record: Any) -> ViewOrder:
+def restore_order(every: ViewOrder, record: Any) -> ViewOrder:
     """Return the order of views by the record of a checkpoint. UserError if the record is broken."""
     try:
         return NewFirst(every, **record)
@@ -69,7 +76,7 @@ def new_photos(run: Any) -> dict[str, Any] | None:
     if not run.start or not (before := _poses_in(Path(run.start).parent)):
         return None
     info, source = run.scene.info, run.dataset.source_path
-    now = {view.image_name: _pose(camera_to_JSON(0, view)) for view in (*info.test_cameras, *info.train_cameras)}
+    now = {view.image_name: _read_pose(camera_to_JSON(0, view)) for view in (*info.test_cameras, *info.train_cameras)}
     new, known = sorted(now.keys() - before.keys()), sorted(now.keys() & before.keys())
     if not new or not known:
         return None
@@ -85,18 +92,18 @@ def new_photos(run: Any) -> dict[str, Any] | None:
             f"{source} has photos that {run.start} was not trained on; give --start_checkpoint {run.start} and name "
             "another folder by -m, as this one keeps the model without them"
         )
-    return {"since": run.first_iteration, "until": _until(run, new), "names": new}
+    return {"since": run.first_iteration, "until": _find_end(run, new), "names": new}
 
 
 def _poses_in(folder: Path) -> dict[str, np.ndarray]:
     """Read the poses of cameras.json by name, in its order; none if the file is missing or of another form."""
     try:
-        return {view["img_name"]: _pose(view) for view in read_json(folder / "cameras.json")}
+        return {view["img_name"]: _read_pose(view) for view in read_json(folder / "cameras.json")}
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         return {}
 
 
-def _pose(record: dict[str, Any]) -> np.ndarray:
+def _read_pose(record: dict[str, Any]) -> np.ndarray:
     """Return position and rotation (4, 3)."""
     return np.array([record["position"], *record["rotation"]], float).reshape(4, 3)
 
@@ -116,7 +123,7 @@ def _refuse_held_out(run: Any, tests: list[str], count: int, before: list[str]) 
         )
 
 
-def _until(run: Any, names: list[str]) -> int:
+def _find_end(run: Any, names: list[str]) -> int:
     """Return the iteration by which new photos have trained as often as the others, at most halfway to the end."""
     since, last, views = run.first_iteration, run.schedule.ends, run.views.cameras
     new = sum(view.image_name in names for view in views)

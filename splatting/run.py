@@ -1,4 +1,7 @@
-"""A training run as a record: what the loop and its observers share, and what an iteration asks."""
+"""A training run as a record: what the loop and its observers share, and what an iteration asks.
+
+A part is a class whose hooks add one feature to a training (splatting/part.py).
+"""
 
 import argparse
 import math
@@ -36,7 +39,7 @@ from splatting.records.training_log import Stopwatch, TrainingLog
 from splatting.resources import announce_memory
 from splatting.save import Checkpoints
 from splatting.schedule import USUAL, Schedule
-from splatting.spill import announce, release_torch
+from splatting.spill import announce_spilled, release_torch
 from splatting.trim_report import TrimReport, trimmed
 from splatting.watch import DivergenceWatch
 
@@ -145,7 +148,7 @@ class Run:
         self.losses.mean = self.log.loss
         self.clock = Stopwatch(joules_counter(self.group.all_gather_objects(nvml_name(self.device))))
         if storage := self.gaussians.storage:
-            announce(self, storage)
+            announce_spilled(self, storage)
             storage.rebalance(self.gaussians)
             self.resources.callback(release_torch)
         if writer is not None:
@@ -161,7 +164,7 @@ class Run:
     def save_last(self, iteration: int, scored: bool) -> TrimReport:
         """Save the model without what it does not need, and the parts' entries of model.json. Return what is left out.
 
-        scored: as for `trimmed`.
+        scored: true to compute how much PSNR the test views lose by it.
         """
         (model, left_out), scene = trimmed(self, scored, iteration), self.scene
         scene.save(iteration, model)
@@ -172,11 +175,13 @@ class Run:
     # What an iteration asks
 
     @cached_property
-    def _terms(self) -> list[Callable]:
+    def _terms_hooks(self) -> list[Callable]:
+        """Hooks `terms` of the parts that have one."""
         return overrides(self.parts, "terms")
 
     @cached_property
-    def _after_step(self) -> list[Callable]:
+    def _after_step_hooks(self) -> list[Callable]:
+        """Hooks `after_step` of the parts that have one."""
         return overrides(self.parts, "after_step")
 
     @property
@@ -216,7 +221,7 @@ class Run:
 
     def add_terms(self, at: Iteration) -> None:
         """Add the terms of parts to the loss of a step."""
-        for terms in self._terms:
+        for terms in self._terms_hooks:
             if found := terms(at):
                 at.terms |= found
                 at.wants_depth |= terms.__self__.needs.depth
@@ -289,7 +294,7 @@ class Run:
 
     def after_step(self, at: Iteration) -> None:
         """Let parts act after the optimiser's step, then the storage of rows, and the blocks that sleep."""
-        for act in self._after_step:
+        for act in self._after_step_hooks:
             act(at)
         if at.changes and self.gaussians.storage:
             self.gaussians.storage.rebalance(self.gaussians)

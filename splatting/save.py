@@ -29,6 +29,7 @@ class Saves(Part):
         return at.takes(self._run.launch.save_iterations)
 
     def measured(self, at: Iteration, losses: Losses) -> None:
+        """Save the PLY in a planned iteration; in the last one without what the model does not need."""
         if not at.takes(self._run.launch.save_iterations):
             return
         run = self._run
@@ -48,6 +49,7 @@ class Saves(Part):
             run.scene.save(at.iteration)
 
     def ended(self, error: Error) -> None:
+        """Print and log what the last save holds and lacks, if there was one."""
         if error is None and self._left_out is not None:
             run = self._run
             folder = saved_ply(run.scene.model_path, self._left_out.iterations).parent

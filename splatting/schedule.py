@@ -103,7 +103,7 @@ class Schedule:
         """Return the strategy of a new run that names none: the first of all."""
         return strategies[0].name
 
-    def nothing_left(self, checkpoint: str, iteration: int) -> str:
+    def nothing_left_message(self, checkpoint: str, iteration: int) -> str:
         """Say why a run that would resume a checkpoint has nothing to do."""
         return (
             f"{checkpoint} is at iteration {iteration}, so --iterations {self.length} leaves nothing to do; "
@@ -118,11 +118,11 @@ class Schedule:
 STEADY = Schedule(0)  # of no length, for those who only ask what an iteration stands for
 
 
-def longer_steps(stride: float, progress: float) -> float:
-    """Return the factor of learning rates where an iteration stands for `stride` of the USUAL ones.
+def stride_rate_factor(stride: float, progress: float) -> float:
+    """Return the factor of learning rates of an iteration that stands for `stride` of the USUAL ones.
 
-    Few steps have to be longer: LONGER times the root of `stride`, at most MOST_RATE and at least 1. Towards the end
-    all steps get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle.
+    A run of few iterations takes longer steps: LONGER times the root of `stride`, at most MOST_RATE and at least 1.
+    Towards the end all steps get shorter, smoothly, down to LEAST_RATE of that, so that the Gaussians settle.
 
     progress: part of the schedule that is done, 0 to 1.
     """

@@ -36,6 +36,7 @@ class Scores(Part):
         return self._run.report is not training_report or at.takes(self._planned)
 
     def measured(self, at: Iteration, losses: Losses) -> None:
+        """Call the run's report, and put the scores that it returns into the iteration's record."""
         if not self.due(at):
             return
         run, seconds = self._run, self._run.clock.seconds - at.started
@@ -101,7 +102,7 @@ def training_report(
             for events in told:
                 events.image(name, camera, what, image)
 
-        if means := _means(scored, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
+        if means := _mean_scores(scored, scene, cameras, l1_loss, show, iteration == testing_iterations[0]):
             line = f"[ITER {iteration}] Evaluating {name}: L1 {means['l1']:.5f}"
             if "psnr" in means:
                 line += f" PSNR {means['psnr']:.3f} (mean of the channels'; {means.pop('whole'):.3f} as metrics.py)"
@@ -115,7 +116,7 @@ def training_report(
 
 
 @torch.no_grad()
-def _means(
+def _mean_scores(
     views: ScoredViews,
     scene: Scene,
     cameras: Sequence[Camera],

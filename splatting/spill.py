@@ -58,7 +58,7 @@ class GpuMemory(Storage):
     """Decides how many rows of f_rest and its averages stay on the GPU.
 
     While rows change, new tensors find the GPU's memory taken by the old ones. What lacks memory lies on the host until
-    `rebalance` brings it back. Nothing is spilled before `reserve` knows the scene.
+    `rebalance` brings it back. Nothing is spilled before `limit_for` knows the scene.
 
     limit: bytes for torch and spilled tensors together, 0: no limit, so that nothing is spilled.
     """
@@ -77,13 +77,19 @@ class GpuMemory(Storage):
             self.limit = min(self.limit, int(_USABLE * there))
         self._limit_torch(0)
 
-    def reserve(self, count: int, scene: Scene) -> None:
-        """Take note of the number of this process's Gaussians to come: a limit begins where they do not fit."""
+    def limit_for(self, count: int, scene: Scene) -> None:
+        """Set a limit by the free memory of the GPU if a number of Gaussians does not fit there.
+
+        A limit that is set already stays.
+
+        count: number of Gaussians of this process, now or later.
+        scene: scene whose photos and largest view need memory, too.
+        """
         self._fixed = PER_PIXEL * largest_view(scene) + photo_bytes(scene.images, self._device)
         if self.limit or self._device.type != "cuda" or not CAN_SPILL:
             return
         limit = int(_USABLE * (free_memory(self._device) + torch.cuda.memory_allocated(self._device)))
-        if self._needed(count, limit) > limit:
+        if self._needed_bytes(count, limit) > limit:
             self.limit = limit
             self._limit_torch(0)
 
@@ -103,12 +109,12 @@ class GpuMemory(Storage):
             return
         rest = gaussians.raw("f_rest")
         state = gaussians.optimizer.state.get(rest, {})
-        rest.data = self._settled(rest.data)
+        rest.data = self._move_rows(rest.data)
         for name in ("exp_avg", "exp_avg_sq"):
             if name in state:
-                state[name] = self._settled(state[name])
+                state[name] = self._move_rows(state[name])
 
-    def _settled(self, values: Tensor) -> Tensor:
+    def _move_rows(self, values: Tensor) -> Tensor:
         wanted = self._resident_bytes(values, len(values))
         if not is_spilled(values) or bytes_of(values)[0] > wanted - _PAGE:
             return values
@@ -120,9 +126,9 @@ class GpuMemory(Storage):
 
     def _spills(self, count: int) -> bool:
         """Tell whether so many rows do not fit, with all that a change of them needs."""
-        return self.limit > 0 and self._needed(count, self.limit) > self.limit
+        return self.limit > 0 and self._needed_bytes(count, self.limit) > self.limit
 
-    def _needed(self, count: int, limit: int) -> int:
+    def _needed_bytes(self, count: int, limit: int) -> int:
         return self._fixed + max(int(_SPARE * limit), _LEAST_SPARE) + count * self._each
 
     def resident_rows(self, count: int) -> int:
@@ -130,7 +136,7 @@ class GpuMemory(Storage):
         if not self._spills(count):
             return count
         # The estimate has room for the copy of one of three tensors while rows change, which here lies on the host.
-        others = self._needed(count, self.limit) - count * self._spillable * 4 / 3
+        others = self._needed_bytes(count, self.limit) - count * self._spillable * 4 / 3
         return resident_rows(self.limit, count, others, count * self._spillable)
 
     def host_bytes(self, count: int) -> int:
@@ -195,10 +201,10 @@ def refuse_without_gpu(device: str) -> None:
         raise UserError("--gpu_memory limits the memory of a GPU, and there is none to use; leave it out")
 
 
-def announce(run: Any, memory: GpuMemory) -> None:
-    """Print how much lies in the host's memory, now or with the most Gaussians to come, and the time that this takes.
+def announce_spilled(run: Any, memory: GpuMemory) -> None:
+    """Print how many bytes lie in the host's memory, and how long their transfers take in a step.
 
-    Warn if the host has too little memory for the expected number.
+    Both are those of the most Gaussians to come. Warn if the host has too little memory for the expected number.
     """
     now, most, size = run.gaussians.gaussian_count, run.strategy.max_gaussians, run.group.size
     later = expected_count(most, now)

@@ -53,7 +53,7 @@ def saved_line(it: TrimReport, folder: Path) -> str:
     if not it.unseen:
         return line
     why = "(opacity below 1/255)" if it.unseen == it.faint else "(no view depends on them)"
-    return f"{line}. Left out {it.unseen:,} invisible Gaussians {why}{_change(it.test_change)}"
+    return f"{line}. Left out {it.unseen:,} invisible Gaussians {why}{_describe_change(it.test_change)}"
 
 
 def _band_bytes(it: TrimReport, degree: int) -> int:
@@ -63,13 +63,14 @@ def _band_bytes(it: TrimReport, degree: int) -> int:
 
 def lines(it: TrimReport) -> list[str]:
     """Return lines about Gaussians, SH bands and photos, for reports."""
-    return [_gaussians(it), _bands(it), _pictures(it)]
+    return [_describe_gaussians(it), _describe_bands(it), _describe_photos(it)]
 
 
-def _gaussians(it: TrimReport) -> str:
+def _describe_gaussians(it: TrimReport) -> str:
+    """Return a line that says how many Gaussians were left out, and how they were found."""
     if it.keep_unseen:
         return "No Gaussian was left out (--keep_unseen)"
-    found = f"{it.unseen:,} invisible Gaussians of {it.gaussians:,} were left out{_share(it, it.unseen)}"
+    found = f"{it.unseen:,} invisible Gaussians of {it.gaussians:,} were left out{_describe_share(it, it.unseen)}"
     found = found if it.unseen else "No Gaussian was left out"
     searched = f"{it.views} views were searched in {it.seconds:.1f} s"
     how = {
@@ -77,15 +78,19 @@ def _gaussians(it: TrimReport) -> str:
         "of the iterations",
         FEW: f"{searched}, with fewer than {100 * WORTH:.0f} % unseen besides",
     }
-    return f"{found}; {how.get(it.search, searched)}{_change(it.test_change)}"
+    return f"{found}; {how.get(it.search, searched)}{_describe_change(it.test_change)}"
 
 
-def _share(it: TrimReport, count: int) -> str:
+def _describe_share(it: TrimReport, count: int) -> str:
     part = count / it.gaussians
     return f" ({100 * part:.1f} %, {it.ply_bytes * part / MB:.2f} MB of the PLY)"
 
 
-def _change(change: dict[str, float]) -> str:
+def _describe_change(change: dict[str, float]) -> str:
+    """Return the end of a line: the change of the test views and of their PSNR, dB; empty if nothing was measured.
+
+    change: result of `change_on_views`.
+    """
     if not change:
         return ""
     text = f"; test views change by at most {change['largest']:.2g} (values 0 to 1)"
@@ -94,7 +99,8 @@ def _change(change: dict[str, float]) -> str:
     return text
 
 
-def _bands(it: TrimReport) -> str:
+def _describe_bands(it: TrimReport) -> str:
+    """Return a line that says which SH bands were left out, or how far cutting them would move colours."""
     if it.sh_degree < it.max_sh_degree:
         saved = _band_bytes(it, it.sh_degree) / MB
         bound = it.cut_bounds[it.sh_degree]
@@ -106,7 +112,8 @@ def _bands(it: TrimReport) -> str:
     return f"All SH bands were kept. Cutting them (--prune_sh) moves colours (values 0 to 1) by at most {moved}"
 
 
-def _pictures(it: TrimReport) -> str:
+def _describe_photos(it: TrimReport) -> str:
+    """Return a line that says how much memory the training photos take, and how much is saved."""
     saved = 4 * it.picture_bytes_in_files - it.picture_bytes
     return (
         f"Colours of the training photos are kept as bytes and at training size: {it.picture_bytes / MB:.1f} MB, "

@@ -36,6 +36,7 @@ class DivergenceWatch(Part):
     """
 
     def __init__(self, run: "Run") -> None:
+        """Give the run's optimisers a guard, which holds back steps after the first one that is not finite."""
         self._run, self._losses = run, run.losses
         self._iteration = run.first_iteration
         self._guard = StepGuard(run.device)
@@ -69,10 +70,10 @@ class DivergenceWatch(Part):
         view = self._run.views[first].image_name
         raise UserError(
             f"{what} of iteration {first} (view {view}) is not finite, so training stopped; "
-            f"{self._saved(good, iteration)}, or check this view and the point cloud"
+            f"{self._save_good(good, iteration)}, or check this view and the point cloud"
         )
 
-    def _saved(self, good: int, iteration: int) -> str:
+    def _save_good(self, good: int, iteration: int) -> str:
         """Save the model after the iteration `good`, unchanged since. Return what was saved, and what to do."""
         run = self._run
         if good == run.first_iteration:
@@ -120,6 +121,7 @@ class MaskWatch(Part):
     """
 
     def __init__(self, views: Sequence[Camera]) -> None:
+        """Begin with all views unseen."""
         self._left = {view.uid for view in views}
         self._views = len(views)
         self._new: list[tuple[str, Tensor]] = []  # name, and share of its pixels that count

@@ -47,7 +47,7 @@ MAY = {
         groundwork.files.image_files.remove_leftovers splatting.commands.render.write_views
         splatting.commands.render.render_set splatting.commands.render.render_sets
         splatting.records.error_curve.continue_curve applications.evaluation.stages._remove_stop splatting.run.open
-        splatting.resume.__init__ splatting.resume.ended splatting.resume._continued
+        splatting.resume.__init__ splatting.resume.ended splatting.resume._may_continue
         splatting.features.robust_mask_residuals.write_masks""",
     "a reserved name in `distorted`, or in a scene that convert.py has made; refuse_foreign_results knows": """
         applications.convert.adding.forget_base applications.convert.adding.keep_base

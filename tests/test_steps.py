@@ -53,7 +53,7 @@ def test_a_host_that_runs_ahead_without_capacity_gives_the_same_bytes(scene, tmp
     plain = trained_as(name, scene, tmp_path / "plain", "--plain_step")
     overflows, replay = [], speculative.Speculation._replay
     monkeypatch.setattr(speculative.Speculation, "_replay", lambda *x: (overflows.append(1), replay(*x)))
-    monkeypatch.setattr(speculative, "_with_spare", lambda count, *_: count)
+    monkeypatch.setattr(speculative, "_add_spare", lambda count, *_: count)
     monkeypatch.setattr(speculative, "_FIRST", (1, 1, 1, 1))
     assert trained_as(name, scene, tmp_path / "overflowing") == plain
     assert len(overflows) > 5
@@ -185,7 +185,7 @@ def test_graphs_give_their_memory_back_where_it_is_short(scene, tmp_path, withou
 @pytest.mark.parametrize("fails", [1, 99])
 def test_without_memory_for_a_graph_steps_are_queued_one_call_after_the_other(scene, tmp_path, monkeypatch, fails, _):
     wanted = trained(scene, tmp_path / "captured")
-    body, launch, asked, taken = Graphs._body, Graphs.launch, [], []
+    body, launch, asked, taken = Graphs._compute_step, Graphs.launch, [], []
 
     def lacking(self, iteration, placeholder):
         asked.append(iteration)
@@ -194,7 +194,7 @@ def test_without_memory_for_a_graph_steps_are_queued_one_call_after_the_other(sc
             raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB.")
         return losses
 
-    monkeypatch.setattr(Graphs, "_body", lacking)
+    monkeypatch.setattr(Graphs, "_compute_step", lacking)
     monkeypatch.setattr(Graphs, "launch", lambda self, at: (taken.append(launch(self, at)), taken[-1])[1])
     assert trained(scene, tmp_path / "queued") == wanted
     assert len(asked) == 2 if fails == 99 else len(asked) > 2
@@ -243,8 +243,8 @@ def test_graphs_that_nobody_has_any_more_do_not_end_a_capture(_):
 
 @pytest.mark.parametrize("_", GPU)
 def test_a_step_that_waits_for_the_gpu_is_not_captured_and_random_numbers_are_there(scene, tmp_path, monkeypatch, _):
-    wanted, body = trained(scene, tmp_path / "captured"), Graphs._body
-    monkeypatch.setattr(Graphs, "_body", lambda self, *of: body(self, *of).sum().item())
+    wanted, body = trained(scene, tmp_path / "captured"), Graphs._compute_step
+    monkeypatch.setattr(Graphs, "_compute_step", lambda self, *of: body(self, *of).sum().item())
     assert trained(scene, tmp_path / "queued") == wanted
     assert torch.rand(3, device="cuda").max() < 1
     held = torch.empty(2**28, dtype=torch.uint8, device="cuda")
@@ -288,7 +288,7 @@ def replay_and_die(self, report):
     if self._done > 30:
         os.kill(os.getpid(), signal.SIGKILL)
 
-speculative._with_spare = lambda count, *_: count
+speculative._add_spare = lambda count, *_: count
 speculative.Speculation._replay = replay_and_die
 test_steps.trained(Path(sys.argv[1]), Path(sys.argv[2]), *test_steps.GROWING, "--checkpoint_iterations", 25)
 """

@@ -80,12 +80,10 @@ class Page:
         self.requests = Requests(self.watchers.wake)
         self._faults: dict[int, str] = {}  # of the browsers' last frames
         self._legends: dict[int, viser.GuiHtmlHandle] = {}
-        name = scene.loaded_iter if of_file else folder.resolve().name
-        self.server, self.url = servers.serve(port, as_utf8(name))
+        self.server, self.url = servers.serve(port, as_utf8(scene.loaded_iter if of_file else folder.resolve().name))
         gui = self.server.gui
-        self.iteration = gui.add_text(
-            "Iteration", str(scene.loaded_iter or 0), disabled=True, visible=not (of_file or untrained)
-        )
+        shown = not (of_file or untrained)
+        self.iteration = gui.add_text("Iteration", str(scene.loaded_iter or 0), disabled=True, visible=shown)
         self.count = gui.add_text("Points" if untrained else "Gaussians", f"{len(gaussians):,}", disabled=True)
         self.tabs = gui.add_tab_group()
         # A training adds bands until its end; of a saved model those beyond its last one that is used are all zero.

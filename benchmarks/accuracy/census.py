@@ -108,7 +108,7 @@ def case_rows(censuses: list[Census], by_case: dict[Case, tuple[Splats, Splats]]
         row = [case.name]
         for axis, value in find_extremes(stiff).items():
             beyond = max(found.axes[axis].beyond(value, below=axis == "depth") for found in censuses)
-            row.append(f"{_short(value)} ({_percent(beyond)})")
+            row.append(f"{_format_short(value)} ({_format_percent(beyond)})")
         rows.append(row)
     return rows
 
@@ -128,20 +128,22 @@ def find_uncovered(found: Census, covered: Iterable[tuple[int, ...]]) -> list[tu
         known = project_counts(covered, pair)
         for cell, count in project_counts(found.cells, pair).items():
             if cell not in known:
-                words = [f"{AXES[names[axis]]} {_class(names[axis], of)}" for axis, of in zip(pair, cell, strict=True)]
+                words = [
+                    f"{AXES[names[axis]]} {_name_class(names[axis], of)}" for axis, of in zip(pair, cell, strict=True)
+                ]
                 gaps.append((count / found.splats, *words))
     return sorted(gaps, reverse=True)
 
 
-def _class(axis: str, number: int) -> str:
+def _name_class(axis: str, number: int) -> str:
     return CLASSES[number] if axis == "opacity" else f"1e{number} to 1e{number + 1}"
 
 
-def _short(value: float) -> str:
+def _format_short(value: float) -> str:
     return f"{value:.3g}" if 1e-3 <= abs(value) < 1e4 else f"{value:.0e}"
 
 
-def _percent(share: float) -> str:
+def _format_percent(share: float) -> str:
     return "0" if share <= 0 else f"{100 * share:.2g}" if share < 0.1 else f"{100 * share:.0f}"
 
 
@@ -149,7 +151,7 @@ def print_report(censuses: list[Census], by_case: dict[Case, tuple[Splats, Splat
     """Print the three tables."""
     header = ["model", "axis", *(f"{100 * share:g} %" for share in SHARES[:-1]), "largest"]
     rows = [
-        [found.label, AXES[axis], *(_short(found.axes[axis].quantile(share)) for share in SHARES)]
+        [found.label, AXES[axis], *(_format_short(found.axes[axis].quantile(share)) for share in SHARES)]
         for found in censuses
         for axis in AXES
     ]
@@ -191,6 +193,7 @@ def draw(path: Path, censuses: list[Census], by_case: dict[Case, tuple[Splats, S
 
 @torch.no_grad()
 def main() -> None:
+    """Print the census of the models that the command line names, beside the stiff cases, and draw it if asked."""
     args = model_parser(__doc__).parse_args()
     device = choose_device(args)
     censuses = []

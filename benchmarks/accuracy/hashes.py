@@ -91,6 +91,7 @@ def make_table(records: Sequence[dict[str, Any]]) -> str:
 
 
 def main() -> None:
+    """Print this machine's hashes as a line of JSON, and a table beside those of other machines."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add_device(parser)
     parser.add_argument("--scene", type=Path, help="the demo scene, made if it is missing (default: made anew)")

@@ -100,7 +100,7 @@ def exact_row(name: str, lens: Lens) -> list[str]:
     row = [name, f"{2 * half_field(lens) / _DEGREE:.0f}", *(f"{e:.1e}" for e in mpmath_errors(lens, means[:_EXACT]))]
     if name not in _EXTRAS:
         return [*row, "", ""]
-    shown = pycolmap.Camera(model=name, width=_WIDTH, height=_HEIGHT, params=_params(name))
+    shown = pycolmap.Camera(model=name, width=_WIDTH, height=_HEIGHT, params=_make_params(name))
     theirs = torch.from_numpy(np.asarray(shown.img_from_cam(means.numpy()))) - 0.5
     pixels = (draw_splats(lens, make_spread(lens), torch.float64, "cpu")[0] - theirs).abs().nan_to_num(0).max()
     return [*row, f"{pixels:.1e}", f"{slopes_error(shown, lens, means.numpy()):.1e}"]
@@ -232,7 +232,7 @@ def slopes_error(shown: pycolmap.Camera, lens: Lens, means: np.ndarray) -> float
     return float((np.abs(ours - theirs[inside]).max((1, 2)) / np.trace(theirs[inside], axis1=1, axis2=2)).max())
 
 
-def _params(model: str) -> list[float]:
+def _make_params(model: str) -> list[float]:
     focals = 2 if model in {"PINHOLE", "OPENCV", "FULL_OPENCV", "OPENCV_FISHEYE", "THIN_PRISM_FISHEYE"} else 1
     focal = 180.0 if "FISHEYE" in model else 400.0
     return [*[focal] * focals, 330.0, 236.0, *_EXTRAS[model]]
@@ -275,11 +275,12 @@ def projection_errors(chart: str, angle: float, deviations: tuple[float, float, 
 
 
 def main() -> None:
+    """Print the errors of all lenses, then those of EWA and of rays against exact rays."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add_device(parser)
     device = choose_device(parser.parse_args())
     print(describe_machine(device))
-    lenses = {name: lens_of(name, tuple(_params(name))) for name in _EXTRAS} | {"panorama": _PANORAMA}
+    lenses = {name: lens_of(name, tuple(_make_params(name))) for name in _EXTRAS} | {"panorama": _PANORAMA}
     header = ["lens", "degrees", "mpmath: pixels", "first", "second", "pycolmap: pixels", "slopes"]
     print_table(header, [exact_row(name, lens) for name, lens in lenses.items()])
     header = ["float32", "pixels", "ewa: image", "gradients", "ray: image", "gradients"]

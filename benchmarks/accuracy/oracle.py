@@ -126,6 +126,7 @@ def print_ratios(runs: Runs) -> None:
 
 
 def main() -> None:
+    """Print the errors of all kernels against the oracle and, with a GPU, their ratio to those of the CPU."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--times", action="store_true", help="also time the kernels")
     args = parser.parse_args()

@@ -60,8 +60,8 @@ def run(problem: Problem, backend: Backend, rows: Tensor | None = None, keep: Te
     weights = [torch.randn(plane.shape, generator=generator, dtype=torch.float64) * keep for plane in planes]
     sum((plane * weight.to(plane)).sum() for plane, weight in zip(planes, weights, strict=True)).backward()
     gradients = {name: leaf.grad for name, leaf in leaves.items()} | {"screen mean": means2d.grad[:, :2]}
-    return _doubles(dict(zip(PLANES, planes, strict=True))), _doubles(gradients), keep
+    return _to_doubles(dict(zip(PLANES, planes, strict=True))), _to_doubles(gradients), keep
 
 
-def _doubles(named: dict[str, Tensor]) -> dict[str, Tensor]:
+def _to_doubles(named: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: t.detach().double().cpu() for name, t in named.items()}

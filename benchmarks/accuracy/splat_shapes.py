@@ -50,6 +50,10 @@ def measure_splats(gaussians: Gaussians, settings: GaussianRasterizationSettings
 
 
 def _measure_chunk(part: Gaussians, settings: GaussianRasterizationSettings, raw: bool) -> Splats:
+    """Measure the Gaussians of a chunk in a view, those that it does not show left out.
+
+    raw: true if the values are those before activation.
+    """
     with torch.device(part.means.device):  # where the oracle makes its constants
         camera = camera_of(settings)
         part = activated(part) if raw else part

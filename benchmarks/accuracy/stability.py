@@ -54,6 +54,7 @@ class Judged:
     """A case with the oracle's planes and gradients, which the results of backends are compared with."""
 
     def __init__(self, case: Case) -> None:
+        """Run the oracle on a case, and find the pixels that its stiff Gaussians reach."""
         self.problem = case.problem()
         p = self.problem
         present = ~p.absent
@@ -79,17 +80,18 @@ class Judged:
         return self._compare(planes, {name: _mask_rows(g, present) for name, g in gradients.items()})
 
     def _compare(self, planes: dict[str, Tensor], gradients: dict[str, Tensor]) -> Result:
+        """Return the errors of planes and gradients, apart for stiff and ordinary Gaussians or their pixels."""
         finite = all(t.isfinite().all() for t in [*planes.values(), *gradients.values()])
         stiff = self.problem.stiff
         by_plane = {
             name: {
-                "ordinary": _error(planes[name], expected, ~self.reached.expand_as(expected) & self.keep),
-                "stiff": _error(planes[name], expected, self.reached.expand_as(expected) & self.keep),
+                "ordinary": _relative_error(planes[name], expected, ~self.reached.expand_as(expected) & self.keep),
+                "stiff": _relative_error(planes[name], expected, self.reached.expand_as(expected) & self.keep),
             }
             for name, expected in self.planes.items()
         }
         by_name = {
-            name: {part: _error(gradients[name], g, stiff == (part == "stiff")) for part in PARTS}
+            name: {part: _relative_error(gradients[name], g, stiff == (part == "stiff")) for part in PARTS}
             for name, g in self.gradients.items()
         }
         return Result(bool(finite), by_plane, by_name)
@@ -132,7 +134,7 @@ def _mask_rows(rows: Tensor, where: Tensor) -> Tensor:
     return out
 
 
-def _error(got: Tensor, expected: Tensor, where: Tensor) -> float:
+def _relative_error(got: Tensor, expected: Tensor, where: Tensor) -> float:
     """The largest |difference| of the part `where`, over its largest |expected|; NaN if the part is empty."""
     difference = (got - expected).abs().nan_to_num(nan=math.inf, posinf=math.inf)[where]
     if not difference.numel():
@@ -163,6 +165,7 @@ def print_report(results: dict[str, dict[str, Result]]) -> None:
 
 
 def main() -> None:
+    """Print the errors of all backends on all cases; end with an error if a result is worse than allowed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="measure the cases whose group or name contains this (default: all)")
     args = parser.parse_args()

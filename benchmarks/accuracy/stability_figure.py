@@ -57,7 +57,7 @@ SWEEPS = [
 ]
 
 
-def _numbers(result: Result) -> dict[str, float]:
+def _worst_numbers(result: Result) -> dict[str, float]:
     return {"image": result.worst("planes", "stiff"), "gradients": result.worst("gradients", "stiff")}
 
 
@@ -66,9 +66,11 @@ def measure(sweep: Sweep) -> list[dict]:
     points = []
     for value in tqdm(sweep.values, desc=sweep.name, leave=False):
         judged = Judged(Case("sweep", f"{sweep.name} {value}", sweep.make(value), PLAIN, cut=sweep.cut(value)))
-        point: dict = {"value": value, ROUNDING: _numbers(judged.one_rounding())}
+        point: dict = {"value": value, ROUNDING: _worst_numbers(judged.one_rounding())}
         for backend in BACKENDS:
-            point[backend.name] = _numbers(judged.result(backend)) | {"milliseconds": judged.milliseconds(backend)}
+            point[backend.name] = _worst_numbers(judged.result(backend)) | {
+                "milliseconds": judged.milliseconds(backend)
+            }
         points.append(point)
     return points
 
@@ -99,6 +101,7 @@ def draw(path: Path, measured: dict[str, list[dict]], title: str) -> None:
 
 
 def main() -> None:
+    """Measure the sweeps, and draw their figure."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("figure", type=Path, help="image file to write")
     args = parser.parse_args()

@@ -126,6 +126,10 @@ def count_guarded(parameters: Parameters, views: Cameras) -> dict[str, float]:
 
 
 def summary(kind: str, runs: dict[str, Training]) -> list[str]:
+    """Return a row of the table: a kind's losses, PSNR, differences to float64, and shapes at the start and the end.
+
+    runs: trainings of the kind, by mode.
+    """
     f, exact, stored = (runs[mode] for mode in MODES)
     first, last = f.rows[0], f.rows[-1]
     apart = [f"{float((r.losses - exact.losses)[-VIEWS:].mean()):+.0e}" for r in (f, stored)]
@@ -184,6 +188,7 @@ def draw_figure(path: Path, found: dict[str, dict[str, Training]]) -> None:
 
 
 def main() -> None:
+    """Train all kinds in all modes, print the tables, and exit with 1 if a number was not finite."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", default="", help="train the kinds whose name contains this (default: all)")
     parser.add_argument("--figure", type=Path, help="image file to write")

@@ -53,7 +53,7 @@ def load_trained(word: str, device: torch.device | str) -> TrainedModel:
     path = Path(name)
     folder = path if path.is_dir() else path.resolve().parent.parent.parent
     if path.is_dir() or (folder / "cfg_args").is_file():
-        iteration = -1 if path.is_dir() else _iteration(path)
+        iteration = -1 if path.is_dir() else _read_iteration(path)
         return _load_training(label or folder.name, folder, iteration, device)
     model = read_model(path)
     gaussians = _make_raw(model, device)
@@ -62,7 +62,7 @@ def load_trained(word: str, device: torch.device | str) -> TrainedModel:
     )
 
 
-def _iteration(ply: Path) -> int:
+def _read_iteration(ply: Path) -> int:
     number = ply.resolve().parent.name.removeprefix("iteration_")
     if not number.isdecimal():
         raise UserError(f"{ply} is in no folder iteration_N of its model; give the model's folder")
@@ -70,6 +70,12 @@ def _iteration(ply: Path) -> int:
 
 
 def _load_training(label: str, folder: Path, iteration: int, device: torch.device | str) -> TrainedModel:
+    """Load a training's model with all its cameras.
+
+    label: name of the model in tables.
+    folder: model folder.
+    device: device of Gaussians and cameras.
+    """
     parser = argparse.ArgumentParser()
     models, pipelines = ModelParams(parser), PipelineParams(parser)
     options = argparse.Namespace(**vars(parser.parse_args([])) | read_cfg_args(folder) | {"model_path": str(folder)})

@@ -53,6 +53,7 @@ def losses(cleaning: Cleaning) -> np.ndarray:
 
 
 def main() -> None:
+    """Print what --clean removes with and without added floaters, and how the views change."""
     parser = OptionParser(description=__doc__.splitlines()[0])
     models, pipelines = ModelParams(parser, sentinel=True), PipelineParams(parser, sentinel=True)
     parser.add_argument("--floaters", type=int, nargs="+", default=[0, 200], help="how many (default: 0 200)")

@@ -37,10 +37,11 @@ CLOSE = 0.02
 
 def true_distances(things: list[Thing], points: np.ndarray) -> np.ndarray:
     """Distances (R,) of points (3, R) from the nearest surface."""
-    return np.min([_distances(thing, points) for thing in things], axis=0)
+    return np.min([_surface_distances(thing, points) for thing in things], axis=0)
 
 
-def _distances(thing: Thing, points: np.ndarray) -> np.ndarray:
+def _surface_distances(thing: Thing, points: np.ndarray) -> np.ndarray:
+    """Return the distances (R,) of points (3, R) from the surface of a thing."""
     shape = thing.shape
     if isinstance(shape, Ground):
         return np.hypot(points[1], np.maximum(np.hypot(points[0], points[2]) - shape.radius, 0))
@@ -65,16 +66,16 @@ def seen_places(things: list[Thing], cameras: list[Camera], count: int) -> np.nd
         distance, _ = trace(things, center.astype(np.float32), direction.astype(np.float32))
         found.append((center + np.where(np.isfinite(distance), distance, 1e9) * direction).T)
     places = np.concatenate(found)
-    return places[_central(places)]
+    return places[_is_central(places)]
 
 
-def _central(points: np.ndarray) -> np.ndarray:
+def _is_central(points: np.ndarray) -> np.ndarray:
     return np.linalg.norm(points - TARGET, axis=1) < RADIUS
 
 
 def spread(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """(P, 3) points in the middle of the scene, evenly spread over a mesh's surface."""
-    faces = faces[_central(vertices[faces].mean(axis=1))]
+    faces = faces[_is_central(vertices[faces].mean(axis=1))]
     areas, rng = np.linalg.norm(area_vectors(vertices, faces), axis=1), np.random.default_rng(0)
     rows = rng.choice(len(faces), POINTS, p=areas / areas.sum())
     shares = rng.dirichlet(np.ones(3), POINTS)
@@ -132,6 +133,7 @@ def texture_psnr(mesh: Mesh, cameras: list[Camera], surfaces: Surfaces) -> tuple
 
 
 def main() -> None:
+    """Print the errors of meshes of a model of the demo's scene, and the PSNR of their textures."""
     parser = OptionParser(description=__doc__.splitlines()[0])
     models, pipelines = ModelParams(parser, sentinel=True), PipelineParams(parser, sentinel=True)
     add = parser.add_argument

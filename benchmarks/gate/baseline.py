@@ -132,6 +132,7 @@ def write_baseline(path: Path, kind: str, record: dict[str, Any]) -> None:
 
 
 def _is_whole(record: Any) -> bool:
+    """Tell whether a stored record has a commit, iterations and finite numbers of all trainings."""
     try:
         trainings = [run for runs in record["scenes"].values() for run in runs]
         numbers = [run[quantity.name] for run in trainings for quantity in QUANTITIES]

@@ -80,7 +80,7 @@ def build_older(commit: str) -> Build:
         with tempfile.TemporaryDirectory(dir=WORK) as work:
             with tarfile.open(fileobj=io.BytesIO(archive.stdout)) as files:
                 files.extractall(work, filter="data")
-            if not _same_extensions(commit):
+            if not _has_same_extensions(commit):
                 _build_extensions(Path(work))
             Path(work).rename(folder)
             Path(work).mkdir()  # for the end of the context
@@ -88,11 +88,15 @@ def build_older(commit: str) -> Build:
     return Build(folder, site if site.is_dir() else None)
 
 
-def _same_extensions(commit: str) -> bool:
+def _has_same_extensions(commit: str) -> bool:
     return subprocess.run(["git", "diff", "--quiet", commit, "--", "submodules"], cwd=ROOT).returncode == 0
 
 
 def _build_extensions(folder: Path) -> None:
+    """Build the extensions of a checkout into its folder `site`. UserError if they do not compile.
+
+    folder: checkout of the stored build.
+    """
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
     names = ("simple-knn", "fused-ssim", "diff-gaussian-rasterization")
     done = subprocess.run(
@@ -115,17 +119,17 @@ def read_head() -> str:
 
 def train_and_score(task: Task, seed: int) -> dict[str, float]:
     """Train by this code, render and score the test views."""
-    found = _trained(task, seed, HERE, scores=True)
+    found = _train_and_report(task, seed, HERE, scores=True)
     counts = {"seed": seed, "Gaussians": found["gaussians"], "bytes": round(MB * found["ply_mb"])}
     return counts | {name: found[name] for name in ("PSNR", "SSIM", "seconds")}
 
 
 def train_and_time(task: Task, seed: int, build: Build | None) -> float:
     """Return the training seconds of this code (None) or of an older build."""
-    return _trained(task, seed, build or HERE)["seconds"]
+    return _train_and_report(task, seed, build or HERE)["seconds"]
 
 
-def _trained(task: Task, seed: int, build: Build, scores: bool = False) -> dict[str, float]:
+def _train_and_report(task: Task, seed: int, build: Build, scores: bool = False) -> dict[str, float]:
     """Train as full_eval.py does; what its report tells of the last iteration."""
     with tempfile.TemporaryDirectory() as folder:
         scene = SceneEntry(task.scene.name, "scenes", task.scene)

@@ -19,6 +19,7 @@ class Calls:
     """Forward alone, with backward, and a step of training, on raw parameters as in training."""
 
     def __init__(self, scene: SplatScene, dtype: torch.dtype = torch.float32, antialiasing: bool = False) -> None:
+        """Make the inputs of the calls: parameters as leaves, settings, and the gradient of the image."""
         self.scene = scene
         self.leaves = scene.leaves(dtype)
         self.settings = scene.settings(dtype, antialiasing=antialiasing)
@@ -63,6 +64,7 @@ class TrainingStep:
 
     @torch.no_grad()
     def __init__(self, scene: SplatScene) -> None:
+        """Make the photo, and Adam's averages and statistics of the Gaussians."""
         self._gaussians = {name: scene.parameters[name] for name in PARAMETERS}
         values, device = self._gaussians.values(), scene.parameters["means"].device
         generator = torch.Generator().manual_seed(1)
@@ -106,6 +108,7 @@ class Stages:
 
     @torch.no_grad()
     def __init__(self, scene: SplatScene) -> None:
+        """Run each operator once, and keep its inputs in `calls`, by the operator's name."""
         settings, size = scene.settings(torch.float32), (scene.height, scene.width)
         inputs = {name: scene.parameters[name] for name in PARAMETERS}
         arguments = scene_arguments(Gaussians(**inputs), settings, raw=True)

@@ -31,6 +31,10 @@ class Call:
     """Forward and backward of an image with so many channels; of `rasterize` if None."""
 
     def __init__(self, scene: SplatScene, channels: int | None) -> None:
+        """Draw random colours or features, and a random gradient of the image.
+
+        channels: number of channels; None: three, by `rasterize`.
+        """
         self._inputs = {k: v for k, v in scene.leaves(torch.float32).items() if not k.startswith("sh")}
         count, width = len(self._inputs["means"]), channels or 3
         generator = torch.Generator(device=self._inputs["means"].device).manual_seed(0)
@@ -55,6 +59,7 @@ class Call:
 
 
 def main() -> None:
+    """Print time and memory of images with each number of channels, beside those of `rasterize`."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add_device(parser)
     parser.add_argument(

@@ -134,14 +134,15 @@ def print_gpu(scenes: Iterator[tuple[str, SplatScene]]) -> None:
     print_table(["", *names], [[stage, *(f"{sums[name, stage]:.3f}" for name in names)] for stage in STAGES])
     print("\nPeak memory above the inputs, gradients included, MiB")
     header = ["workload", "forward", "Faster-GS", "gsplat", "+ backward", "Faster-GS", "gsplat"]
-    print_table(header, [_memory_row(workload) for workload in found])
+    print_table(header, [_make_memory_row(workload) for workload in found])
     print(f"\nMs: medians of {REPEATS} calls after {WARM_UPS}, each on an idle device. Call: events around the call,")
     print("host included. Kernels: the device's own work.")
     header = ["workload", "", "call", "kernels", "Faster-GS", "gsplat", "call / Faster-GS"]
-    print_table(header, [row for workload in found for row in _time_rows(workload)])
+    print_table(header, [row for workload in found for row in _make_time_rows(workload)])
 
 
-def _memory_row(workload: Measured) -> list[str]:
+def _make_memory_row(workload: Measured) -> list[str]:
+    """Return the row of a workload's memory: ours, then that of Faster-GS and gsplat where they are known."""
     row = [workload.name]
     for i, own in enumerate(workload.memory):
         others = [of.get(workload.name) for of in (FASTER_GS_MEMORY, GSPLAT_MEMORY)]
@@ -149,7 +150,8 @@ def _memory_row(workload: Measured) -> list[str]:
     return row
 
 
-def _time_rows(workload: Measured) -> list[list[str]]:
+def _make_time_rows(workload: Measured) -> list[list[str]]:
+    """Return the rows of a workload's times, ms: the call, its kernels, and the times of others where known."""
     rows = []
     for i, step in enumerate(workload.times):
         time = workload.times[step]
@@ -208,6 +210,7 @@ def set_lens(scene: SplatScene, projection: str, lens: str | None) -> SplatScene
 
 
 def main() -> None:
+    """Print the times of the workloads or models that the command line names, on a CPU or a GPU."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     add_device(parser)

@@ -35,6 +35,7 @@ class WorkloadRun(Run):
     """
 
     def __init__(self, workload: Workload, steps: int, still: bool, sleep: bool = False, gpu_memory: float = 0) -> None:
+        """Make the run as train.py does, with a scene that has cameras and nothing else."""
         group, device, gaussians = ranks(), compute_device(), GaussianModel(3)
         words = ["-s", ".", "--iterations", str(steps), "--densify_from_iter", "10000", *_STILL * still]
         words += ["--strategy", "adc", *(["--gpu_memory", str(gpu_memory)] if gpu_memory else [])]
@@ -48,10 +49,10 @@ class WorkloadRun(Run):
         scene.getTrainCameras = lambda: cameras
         if gpu_memory:
             gaussians.storage = make_storage(gaussians, opt, device, absolute=False)
-            gaussians.storage.reserve(-(-workload.gaussians // group.size), scene)
+            gaussians.storage.limit_for(-(-workload.gaussians // group.size), scene)
         made = Schedule(opt.iterations), scene, gaussians, ViewOrder(cameras, opt.seed)
         super().__init__(dataset, opt, pipe, launch, group, device, None, 0, [], *made)
-        self._begin(workload)
+        self._begin_model(workload)
         self.objective = Objective(self)
         self.log, self.rows = SimpleNamespace(seconds_before=0.0), []
         self.watch = DivergenceWatch(self)
@@ -62,7 +63,8 @@ class WorkloadRun(Run):
             sort_rows(gaussians)
             self.sleeping = Sleeping(gaussians)
 
-    def _begin(self, workload: Workload) -> None:
+    def _begin_model(self, workload: Workload) -> None:
+        """Give the model this rank's rows of the workload, and an optimiser."""
         gaussians, here = self.gaussians, self.group
         gaussians.divide(here)
         keep = torch.device("cpu") if gaussians.storage else self.device

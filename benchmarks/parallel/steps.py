@@ -65,6 +65,7 @@ class Timing(Part):
         return False
 
     def stepped(self, at: Iteration) -> None:
+        """Note the time at the end of each block of iterations, once the GPU has done them."""
         done = at.iteration - self._first
         if done >= 0 and done % _BLOCK == 0 and at.iteration <= self._until:
             if self._device.type == "cuda":
@@ -203,6 +204,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
+    """Measure one case as a process of torchrun, or launch all cases in turns and print their table."""
     args = make_parser().parse_args()
     if args.case:
         found = measure(args.case)

@@ -111,7 +111,7 @@ class Workload:
         """VIEWS cameras. In XL all see the same, those of the city stand around it. All have the same photo."""
         size = self.width // self.crop, self.height // self.crop
         fovx, fovy = (focal2fov(fov2focal(FOV, self.width), pixels) for pixels in size)
-        photo = InMemory(_photo(*size))
+        photo = InMemory(_make_photo(*size))
         poses = [make_pose(i) if self.name == "city" else (np.eye(3), np.zeros(3)) for i in range(VIEWS)]
         infos = [
             CameraInfo(0, *pose, fovy, fovx, None, "", f"{i}", "", *size, image=photo) for i, pose in enumerate(poses)
@@ -124,7 +124,7 @@ CITY = Workload("city", 20_000_000, 3840, 2160, 1.1)
 ALL = {workload.name: workload for workload in (XL, CITY)}
 
 
-def _photo(width: int, height: int) -> Tensor:
+def _make_photo(width: int, height: int) -> Tensor:
     """Smooth colours (3, H, W) uint8, so that a training towards them gets somewhere."""
     coarse = torch.rand(
         1, 3, math.ceil(height / 64) + 1, math.ceil(width / 64) + 1, generator=torch.Generator().manual_seed(0)

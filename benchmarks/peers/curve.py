@@ -22,6 +22,7 @@ SECONDS, CURVE = "seconds.csv", "peer.csv"
 
 
 def main() -> None:
+    """Score the PLYs of a folder on the test views, and write the curve."""
     parser = OptionParser(description=__doc__.splitlines()[0])
     model_params, pipeline_params = ModelParams(parser, sentinel=True), PipelineParams(parser, sentinel=True)
     parser.set_defaults(ply=SECONDS)  # a folder of another program need not have cfg_args

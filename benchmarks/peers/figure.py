@@ -78,6 +78,7 @@ def read_published(path: str, scenes: Sequence[str]) -> dict[str, Curve]:
 
 
 def main() -> None:
+    """Draw the lines that the command line names: ours, those of --time_budget, other programs', published ones."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("png", metavar="PNG", help="the figure to write")
     parser.add_argument("--title", default="", help="above the figure (default: none)")

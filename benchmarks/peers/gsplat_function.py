@@ -26,6 +26,12 @@ class Call:
     """Forward and backward of an image with so many channels by one of both functions."""
 
     def __init__(self, function: Callable, scene: SplatScene, channels: int, packed: bool) -> None:
+        """Draw random colours and a random gradient of the image.
+
+        function: `rasterization`, gsplat's or ours.
+        channels: number of channels.
+        packed: argument of the function.
+        """
         given, device = scene.parameters, scene.parameters["means"].device
         generator = torch.Generator(device).manual_seed(0)
         rows = [given["means"], given["rotations"], given["scales"].exp(), given["opacities"].sigmoid().flatten()]
@@ -64,6 +70,7 @@ def difference(found: Tensor, wanted: Tensor) -> tuple[float, float]:
 
 
 def main() -> None:
+    """Print times, memory and differences of both functions on the workloads."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--workloads", nargs="+", choices=GPU_WORKLOADS, default=["S", "M", "L"], help="(default: S M L)"
@@ -83,7 +90,7 @@ def main() -> None:
         for channels in args.channels:
             calls = [Call(function, scene, channels, packed=False) for function in (gsplat.rasterization, ours)]
             row = [workload, str(channels)]
-            milliseconds = [(_forward(call), gpu_milliseconds(call)) for call in calls]
+            milliseconds = [(_time_forward(call), gpu_milliseconds(call)) for call in calls]
             row += [f"{time:.2f}" for one in milliseconds for time in one]
             row.append(f"{milliseconds[0][1] / milliseconds[1][1]:.2f}")
             times.append(row + [f"{measure_peak_mib(call, call.clear):.0f}" for call in calls])
@@ -100,7 +107,7 @@ def main() -> None:
     print_table(["workload", "channels", "image", *_NAMES], differences)
 
 
-def _forward(call: Call) -> float:
+def _time_forward(call: Call) -> float:
     with torch.no_grad():
         return gpu_milliseconds(call.image)
 

@@ -80,6 +80,7 @@ class Training:
     """Parameters, optimisers and strategy, and how far they have come."""
 
     def __init__(self, scene: Scene, options: ModelParams, args: argparse.Namespace) -> None:
+        """Start gsplat's parameters, optimisers and strategy, and render once to compile what is missing."""
         try:
             import gsplat
         except ImportError as error:
@@ -92,7 +93,7 @@ class Training:
             [make_view(of, self.frame, self.background) for of in scene.getTrainCameras()], args.seed
         )
         self._extent = scene.cameras_extent * self.frame.scale
-        self.params = torch.nn.ParameterDict(self._start(scene)).to(device)
+        self.params = torch.nn.ParameterDict(self._make_parameters(scene)).to(device)
         self._optimizers = {
             name: torch.optim.Adam(
                 [self.params[name]], rate * (self._extent if name == "means" else 1), eps=1e-15, fused=True
@@ -108,7 +109,8 @@ class Training:
         self._strategy.check_sanity(self.params, self._optimizers)
         self.render(next(self._views), 0)  # compiles what is missing
 
-    def _start(self, scene: Scene) -> dict[str, torch.nn.Parameter]:
+    def _make_parameters(self, scene: Scene) -> dict[str, torch.nn.Parameter]:
+        """Return the first parameters by gsplat's names, in the frame of `find_frame`."""
         rows = start_rows(scene.info.point_cloud, scene.cameras_extent, DEGREE)
         values = {
             "means": ((rows["xyz"] - torch.from_numpy(self.frame.center)) * self.frame.scale).float(),
@@ -162,6 +164,7 @@ class Training:
 
 
 def main() -> None:
+    """Train by gsplat as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--strategy", choices=("default", "mcmc"), default="default", help="gsplat's (default: default)"

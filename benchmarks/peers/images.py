@@ -43,6 +43,8 @@ def make_draws(scene: SplatScene) -> dict[str, Callable[[], Image]]:
         return lambda: rasterize(means2d=zeros, settings=settings, raw=True, **given).color.permute(1, 2, 0)
 
     def by_higs(tile: int, compression: str) -> Callable[[], Image]:
+        """Return a function that prepares gsplat's HiGS and returns a function that draws by it."""
+
         def made() -> Image:
             from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
 
@@ -74,6 +76,7 @@ def host_milliseconds(draw: Image) -> float:
 
 
 def main() -> None:
+    """Print the times of all ways to draw the workloads' images, and how far the images differ."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
         "--workloads", nargs="+", choices=GPU_WORKLOADS, default=list(GPU_WORKLOADS), help="(default: all)"

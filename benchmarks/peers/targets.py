@@ -67,7 +67,11 @@ def read_stored(folder: Path, scenes: Sequence[str]) -> list[Curve]:
     return found
 
 
-def _table(curves: Sequence[Curve], by_target: Mapping[float, Mapping[str, Sequence[float]]]) -> list[list[str]]:
+def _make_rows(curves: Sequence[Curve], by_target: Mapping[float, Mapping[str, Sequence[float]]]) -> list[list[str]]:
+    """Return a row for each program: its curves, its fewest points, and its trainings that reached each target.
+
+    by_target: seconds of each training until its target, infinite if it never got there, by target and program.
+    """
     rows = []
     for program in dict.fromkeys(curve.program for curve in curves):
         own = [len(curve.points) for curve in curves if curve.program == program]
@@ -105,6 +109,7 @@ def draw(path: Path, panels: Mapping[str, Mapping[str, Steps]], x: str, y: str) 
 
 
 def main() -> None:
+    """Print when the curves of the folders reach their targets, and draw the distributions."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER", help="outputs of full_eval.py, or alike")
     parser.add_argument("--stored", type=Path, metavar="FOLDER", help="curves of other programs (default: none)")
@@ -125,7 +130,7 @@ def main() -> None:
     by_target = {target: measure_times(curves, best, target) for target in TARGETS}
     print()
     head = [text for target in TARGETS for text in (f"within {target:g} dB", "median (s)")]
-    print_table(["program", "runs", "fewest samples", *head], _table(curves, by_target))
+    print_table(["program", "runs", "fewest samples", *head], _make_rows(curves, by_target))
     print("\nOf all runs: one that never arrives counts as never. The first sample counts; nothing is interpolated.")
     mkdir_p(args.figures)
     panels = {

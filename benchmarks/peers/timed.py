@@ -45,7 +45,7 @@ def shuffle_forever(views: Sequence, seed: int) -> Iterator:
         yield from rng.sample(views, len(views))
 
 
-def _now() -> float:
+def _read_clock() -> float:
     if compute_device().type == "cuda":
         torch.cuda.synchronize()
     return time.perf_counter()
@@ -55,10 +55,10 @@ def run(training: Training, model: Path, saves: Sequence[int]) -> list[Row]:
     """Train to the last of `saves`, write a PLY at each, and return rows of SECONDS."""
     rows, seconds, done = [], 0.0, 0
     for stop in saves:
-        begin = _now()
+        begin = _read_clock()
         for step in range(done, stop):
             training.step(step)
-        seconds, done = seconds + _now() - begin, stop
+        seconds, done = seconds + _read_clock() - begin, stop
         mkdir_p(saved_ply(model, stop).parent)
         training.save(saved_ply(model, stop))
         peak = torch.cuda.max_memory_allocated() / 2**20 if compute_device().type == "cuda" else None

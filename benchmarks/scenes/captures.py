@@ -54,7 +54,7 @@ def restrict_model(model: "pycolmap.Reconstruction", photos: Mapping[str, Path])
     found, numbers = pycolmap.Reconstruction(), {}
     images = {image.name: image for image in model.images.values()}
     for number, (name, path) in enumerate(sorted(photos.items()), 1):
-        key = images[name].camera_id, _size(path)
+        key = images[name].camera_id, _read_size(path)
         if key not in numbers:
             numbers[key] = len(numbers) + 1
             found.add_camera_with_trivial_rig(_resize_camera(images[name].camera, key[1], numbers[key]))
@@ -65,13 +65,17 @@ def restrict_model(model: "pycolmap.Reconstruction", photos: Mapping[str, Path])
     return found
 
 
-def _size(path: Path) -> tuple[int, int]:
+def _read_size(path: Path) -> tuple[int, int]:
     """Width and height of a photo as it is displayed."""
     with Image.open(path) as image:
         return image.size[::-1] if image.getexif().get(ExifTags.Base.Orientation, 1) >= _LYING else image.size
 
 
 def _resize_camera(camera: "pycolmap.Camera", size: tuple[int, int], number: int) -> "pycolmap.Camera":
+    """Return a camera of another size (width, height): rescaled, or cropped if the shape is another one.
+
+    number: camera_id of the result.
+    """
     import pycolmap
 
     camera = pycolmap.Camera(camera.todict() | {"camera_id": number})
@@ -249,6 +253,7 @@ def make(name: str, scenes: Path, out: Path) -> Path:
 
 
 def main() -> None:
+    """Make the sets that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, help="folder for the sets")
     parser.add_argument("names", nargs="+", choices=SETS, metavar="NAME", help=f"sets to make: {', '.join(SETS)}")

@@ -143,12 +143,12 @@ def read_truth(photos: Path, run: Path) -> "pycolmap.Reconstruction | None":
         return truth
     # convert.py numbers the frames that it takes anew, and they look like themselves.
     frames = sorted((photos / "frames").iterdir())
-    small = np.stack(list(map(_small, frames)))
+    small = np.stack(list(map(_shrink, frames)))
     taken = sorted((run / "input").iterdir())
-    return restrict_model(truth, {frames[np.abs(small - _small(path)).sum(1).argmin()].name: path for path in taken})
+    return restrict_model(truth, {frames[np.abs(small - _shrink(path)).sum(1).argmin()].name: path for path in taken})
 
 
-def _small(path: Path) -> np.ndarray:
+def _shrink(path: Path) -> np.ndarray:
     with Image.open(path) as image:
         return np.asarray(image.convert("L").resize(_SMALL, Image.Resampling.BOX), dtype=np.float32).ravel()
 
@@ -323,6 +323,7 @@ def draw(path: Path, labels: Sequence[list[str]], results: Sequence[Result]) -> 
 
 
 def main() -> None:
+    """Convert the sets, print results and stages, and draw the stages if asked."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
     names = list(dict.fromkeys(row.name for row in ROWS))

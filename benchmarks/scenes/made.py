@@ -109,6 +109,7 @@ def expose_photos(photos: list[Path]) -> None:
 
 
 def main() -> None:
+    """Make the scenes that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("out", type=Path, help="folder for the scenes")
     parser.add_argument("names", nargs="+", choices=MADE, help="scenes to make")

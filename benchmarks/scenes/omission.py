@@ -66,6 +66,7 @@ def make_rows(names: Sequence[str], records: Sequence[dict[str, Any]]) -> list[l
 
 
 def main() -> None:
+    """Train with each omission left in, and print a table for each scene."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--left_in", nargs="+", choices=OMISSIONS, default=list(OMISSIONS), help="default: all")
     args, words = arguments(parser, [0, 1, 2])

@@ -35,6 +35,7 @@ def disturb_poses(scene: Path, out: Path, degrees: float, percent: float, seed: 
 
 
 def main() -> None:
+    """Write a scene with moved poses, as the command line says."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scene", type=Path, help="a COLMAP scene")
     parser.add_argument("out", type=Path, help="new folder for the scene")

@@ -24,7 +24,7 @@ def grain(p: np.ndarray, seed: int) -> np.ndarray:
     return total
 
 
-def _along_corridor(p: np.ndarray) -> np.ndarray:
+def _color_corridor(p: np.ndarray) -> np.ndarray:
     """Walls that repeat from door to door, with a mark at some; the ends are bare."""
     x, y, z = p
     place = np.floor(z / np.float32(_DOOR))
@@ -45,7 +45,7 @@ def _along_corridor(p: np.ndarray) -> np.ndarray:
 def corridor(_: int | None = None) -> list[Thing]:
     """A tunnel of equal doors."""
     half = _DOOR * _DOORS / 2
-    return [Thing(Box((0, -_HIGH / 2, half), (_WIDE, _HIGH / 2, half), 0), _along_corridor, emissive=True)]
+    return [Thing(Box((0, -_HIGH / 2, half), (_WIDE, _HIGH / 2, half), 0), _color_corridor, emissive=True)]
 
 
 def corridor_views(width: int, height: int) -> list[View]:
@@ -74,7 +74,7 @@ class Hollow(NamedTuple):
         return np.where(end > 0, end, np.float32(np.inf))
 
 
-def _of_rooms(p: np.ndarray) -> np.ndarray:
+def _color_rooms(p: np.ndarray) -> np.ndarray:
     """Walls of other colours in each room."""
     return np.where(p[0] < _PASSAGE.center[0], grain(p, 4), grain(p, 6))
 
@@ -82,7 +82,7 @@ def _of_rooms(p: np.ndarray) -> np.ndarray:
 def rooms(_: int | None = None) -> list[Thing]:
     """Two rooms with furniture at their walls, and a door between them."""
     rng, things = np.random.default_rng(2), []
-    things.append(Thing(Hollow((*_ROOMS, _PASSAGE)), _of_rooms, emissive=True))
+    things.append(Thing(Hollow((*_ROOMS, _PASSAGE)), _color_rooms, emissive=True))
     for k, room in enumerate(_ROOMS):
         low = rng.uniform(0.2, 0.3)
         places = [(-1.9, -1.4), (-0.8, 1.5), (0.5, -1.5), (1.7, 1.4), (-1.8, 1.4), (1.6, -1.5)]

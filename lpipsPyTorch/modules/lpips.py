@@ -14,6 +14,11 @@ class LPIPS(nn.Module):
     """
 
     def __init__(self, net_type: str = "alex", version: str = "0.1") -> None:
+        """Load the network.
+
+        net_type: backbone, "alex", "vgg" or "squeeze".
+        version: "0.1", the only one.
+        """
         super().__init__()
         if version != "0.1":
             raise ValueError(f"LPIPS has version 0.1 here, got {version!r}: leave the argument out")

@@ -86,10 +86,11 @@ def find_pairs(model: Path) -> dict[str, list[Pair]]:
         elif not (model / "cfg_args").is_file():
             remedy = "pass a model folder that render.py has written into as -m"
         raise UserError(f"no rendered test views in {test}; {remedy}")
-    return {folder.name: _pairs_of(folder) for folder in methods}
+    return {folder.name: _list_pairs(folder) for folder in methods}
 
 
-def _pairs_of(method: Path) -> list[Pair]:
+def _list_pairs(method: Path) -> list[Pair]:
+    """List the pairs of one method, sorted by name. UserError for images that are missing, unequal or outdated."""
     names = {}
     if (method / INCOMPLETE).is_file():
         raise UserError(f"rendering of {method} was interrupted; run render.py again")
@@ -157,7 +158,7 @@ def _lpips_metric(network: torch.nn.Module, unit_range: bool, device: torch.devi
     @torch.no_grad()
     def metric(render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
         network.spatial = mask is not None  # without a mask the layers' means are added, as published
-        distance = network(*_tensors(render, truth, mask, device), normalize=not unit_range)
+        distance = network(*_to_tensors(render, truth, mask, device), normalize=not unit_range)
         return float(distance if mask is None else distance[0, 0][torch.from_numpy(mask).to(device)].mean())
 
     return metric
@@ -165,10 +166,10 @@ def _lpips_metric(network: torch.nn.Module, unit_range: bool, device: torch.devi
 
 def _dists_metric(network: torch.nn.Module, device: torch.device) -> Metric:
     """Return DISTS by the network of `load_dists`."""
-    return lambda render, truth, mask: float(network(*_tensors(render, truth, mask, device)))
+    return lambda render, truth, mask: float(network(*_to_tensors(render, truth, mask, device)))
 
 
-def _tensors(
+def _to_tensors(
     render: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, device: torch.device
 ) -> list[torch.Tensor]:
     """Return both images (1, 3, H, W) in [0, 1]; pixels of the render that do not count are the ground truth's."""
@@ -221,7 +222,7 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
     with Bar(total=len(pairs), desc=title, unit="view") as bar:
         for first in range(0, len(pairs), size):
             batch = pairs[first : first + size]
-            for pair, (render, truth, mask) in zip(batch, in_threads(_images_of, batch, disable=True), strict=True):
+            for pair, (render, truth, mask) in zip(batch, in_threads(_read_pair, batch, disable=True), strict=True):
                 if mask is None or mask.any():
                     for key, metric in metrics.items():
                         scores[key][pair.name] = metric(render, truth, mask)
@@ -231,13 +232,13 @@ def score(pairs: list[Pair], metrics: dict[str, Metric], title: str, errors: boo
     return scores
 
 
-def _images_of(pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+def _read_pair(pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
     """Return render and ground truth (H, W, 3) uint8, and the mask (H, W) bool of the pixels that count, None: all."""
     render, truth = (np.asarray(image_of(file)) for file in (pair.render, pair.truth))
     return render, truth, mask_of(pair.truth.parents[1], pair.name)
 
 
-def _unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> dict[str, float | None]:
+def _score_unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> dict[str, float | None]:
     """Return the PSNR of whole views in the right halves that the fitted views show, by file name.
 
     scored: file names of the views that are scored.
@@ -336,6 +337,7 @@ def keep_networks(model: Path, method: str, scores: Scores) -> list[str]:
 
 
 def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str, Metric], error_maps: bool) -> None:
+    """Score all methods of a model folder, print means and worst views, and write the three files of scores."""
     held_out = trained_with_eval(model)
     if held_out is False:
         print(f"warning: {model} was trained without --eval, so these scores are of training views")
@@ -345,7 +347,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
             print(f"{model} {name}: kept {', '.join(kept)} of an earlier scoring of the same pictures")
         scores |= depth_scores(model / "test" / name)
         if (plain := methods.get(name.removesuffix(f"_{FITTED}"), methods[name])) is not methods[name]:
-            scores |= {"PSNR_UNFITTED": _unfitted(plain, methods[name], scores["PSNR"])}
+            scores |= {"PSNR_UNFITTED": _score_unfitted(plain, methods[name], scores["PSNR"])}
     results = {name: {key: mean(values) for key, values in scores.items()} for name, scores in per_view.items()}
     for name, means in results.items():
         shown = "  ".join(f"{key} {'null' if value is None else f'{value:.4f}'}" for key, value in means.items())
@@ -369,6 +371,7 @@ def _score_model(model: Path, methods: dict[str, list[Pair]], metrics: dict[str,
 
 
 def main() -> None:
+    """Score the model folders that the command line names."""
     parser = OptionParser(description="Score rendered test views: PSNR, SSIM, LPIPS, DISTS, ST-LPIPS.")
     add = parser.add_argument
     add("-m", "--model_paths", type=Path, nargs="+", required=True,

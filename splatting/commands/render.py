@@ -207,7 +207,7 @@ def render_sets(
     planes: those of PLANES to write, too.
     ply: model of any tool to render instead, into folders that have its name.
     """
-    scene, background = _loaded(dataset, iteration, sh_degree, ply, pipeline)
+    scene, background = _load_scene(dataset, iteration, sh_degree, ply, pipeline)
     drawn = scene.gaussians, pipeline, background, scene.halves, separate_sh
     if not skip_train:
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
@@ -228,7 +228,7 @@ def render_sets(
         warn_if_elsewhere(ply, folder)
 
 
-def _loaded(
+def _load_scene(
     dataset: argparse.Namespace,
     iteration: int,
     sh_degree: int | None,
@@ -255,7 +255,7 @@ def _loaded(
     return scene, torch.full((3,), 1.0 if options.white_background else 0.0, device=compute_device())
 
 
-def _small(path: Path) -> np.ndarray:
+def _read_small(path: Path) -> np.ndarray:
     """Read a picture at _SMALL: (h, w, 3) float64, 0 to 255."""
     with open_image(path) as image:
         return np.asarray(image.convert("RGB").resize(_SMALL), float)
@@ -267,7 +267,7 @@ def warn_if_elsewhere(model: str, folder: Path) -> None:
     if len(names) < _FEWEST:
         return
     names = names[:: -(-len(names) // _COMPARED)]
-    renders, photos = (np.stack([_small(folder / side / name) for name in names]) for side in ("renders", "gt"))
+    renders, photos = (np.stack([_read_small(folder / side / name) for name in names]) for side in ("renders", "gt"))
     errors = np.abs(renders[:, None] - photos).mean(axis=(2, 3, 4))
     fit = (errors.diagonal()[:, None] < errors).sum(axis=1) >= _BETTER * (len(names) - 1)
     if fit.mean() < _FITTING:
@@ -280,6 +280,7 @@ def warn_if_elsewhere(model: str, folder: Path) -> None:
 
 
 def main() -> None:
+    """Render what the command line asks for: views of a model, a video along a path, or the scene from above."""
     parser = OptionParser(description="Render the train and test views of a trained model, or a video of it.")
     # Each photo is used once, so few are kept in memory.
     model_params = ModelParams(parser, sentinel=True, without=("images_to_load",))
@@ -308,7 +309,7 @@ def main() -> None:
     warn_of_background(options)
     request = path_request(args)
     if request:
-        scene, background = _loaded(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
+        scene, background = _load_scene(options, args.iteration, args.typed_sh_degree, args.ply, pipeline, saved_scene)
         if request.make is None:
             from gaussian_renderer.camera_paths.from_above import render_top  # rarely needed
 

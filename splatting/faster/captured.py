@@ -24,6 +24,7 @@ class CapturedStep(FusedStep):
     """Takes steps as `FusedStep` does, but does not wait for the GPU unless something reads or changes the model."""
 
     def __init__(self, run: Run) -> None:
+        """Prepare the graphs and, where cameras are trained, page-locked rows for the gradients of cameras."""
         super().__init__(run)
         self._ahead = Speculation(run.device, self)
         self._graphs = Graphs(run, self, self._adam, self._ahead.capacity)
@@ -51,6 +52,10 @@ class CapturedStep(FusedStep):
         return True
 
     def throttle(self, at: Iteration) -> None:
+        """Wait until this step may be queued; wait for all pending steps if it cannot be queued.
+
+        Where cameras are trained, first take those of their pending steps that change this view's pose.
+        """
         if self._is_queued(at):
             self._ahead.throttle()
             if host := self._run.camera_steps:

@@ -21,6 +21,7 @@ class FusedStep(FasterSteps):
     """
 
     def __init__(self, run: Run) -> None:
+        """Prepare the fused optimiser and, where cameras are trained, the gradient of a camera's numbers."""
         self._run = run
         pose = torch.zeros(CAMERA_NUMBERS, dtype=torch.float64, device=run.device) if run.camera_steps else None
         self.camera_gradient = pose  # of the last step
@@ -36,6 +37,7 @@ class FusedStep(FasterSteps):
         return run.is_standard and not (run.launch.plain_step or torch.is_anomaly_enabled())
 
     def take(self, at: Iteration, tell: Tell) -> bool:
+        """Take the step, and tell observers its losses. Return False for a step that `plain_step` must take."""
         if not self._fuses(at):
             return False
         drawn, losses, gradients = self.measure(at)
@@ -67,7 +69,7 @@ class FusedStep(FasterSteps):
     def measure(self, at: Iteration, now: Tensor | None = None) -> Measured:
         """Render a view. Return what was drawn, the losses, and the losses' gradients by image and depth.
 
-        now: as for `Drawn.step`.
+        now: (NOW_WORDS,) int64 on the GPU, numbers of the step that a graph reads; None: the step is not captured.
         """
         run = self._run
         if run.camera_steps and now is None:

@@ -47,6 +47,11 @@ class Graphs:
     def __init__(
         self, run: Run, fused: FusedStep, adam: FusedAdam, capacity: Callable[[None], AbstractContextManager]
     ) -> None:
+        """Allocate the fixed places on the GPU from which graphs read the numbers of a step.
+
+        fused: renders and differentiates the view that a graph records.
+        adam: optimiser whose step a graph records.
+        """
         self._run, self._fused, self._adam, self._capacity = run, fused, adam, capacity
         self._recorder = Recorder(run.device)
         words = NOW_WORDS + (_CAMERA + 1) // 2 + 1  # the last one: the index of the photo
@@ -63,7 +68,7 @@ class Graphs:
 
     def launch(self, at: Iteration) -> Losses | None:
         """Take a step of the run. Return None, having done nothing, where the step has to be taken in another way."""
-        graph = self._graph_for(at) if self._is_usual(at) else None
+        graph = self._find_graph(at) if self._is_usual(at) else None
         if graph is None:
             return None
         target, _ = at.camera.ground_truth(at.background)
@@ -118,7 +123,7 @@ class Graphs:
         """Tell whether the photo has no mask, and the terms of parts can be captured."""
         return self._able and at.captured and at.camera.counts_all_pixels
 
-    def _graph_for(self, at: Iteration) -> _Graph | None:
+    def _find_graph(self, at: Iteration) -> _Graph | None:
         """Return the graph for a step, captured if that is worth it; None without a graph.
 
         The first step of a kind is not captured, as it may load kernels.
@@ -136,12 +141,12 @@ class Graphs:
             return None
         self._graphs = {k: known for k, known in self._graphs.items() if k[-3:] == phase}
         if len(self._graphs) < _MOST_KINDS:
-            graph = self._captured(at)
+            graph = self._try_capture(at)
             if graph is not None:
                 self._graphs[kind] = graph
         return graph
 
-    def _captured(self, at: Iteration) -> _Graph | None:
+    def _try_capture(self, at: Iteration) -> _Graph | None:
         """Capture a step. Return None, for good, where memory or the objective does not allow it."""
         try:
             try:
@@ -158,6 +163,10 @@ class Graphs:
             self._run.gaussians.exposures.optimizer.zero_grad()  # what was recorded has computed no gradient
 
     def _capture(self, at: Iteration) -> _Graph | None:
+        """Capture the step of an iteration's kind. Return None if its loss depends on more than image and exposures.
+
+        A placeholder stands for the iteration: its camera, photo and background are the places that `launch` fills.
+        """
         camera, target = at.camera, torch.empty_like(at.camera.ground_truth(at.background)[0])
         numbers = self._inputs[NOW_WORDS:].view(torch.float32)
         # Stand for any iteration of the kind. An objective that asks for more than this cannot be captured.
@@ -187,14 +196,15 @@ class Graphs:
         )
         self._run.add_terms(placeholder)
         with self._capacity(None):
-            launch, losses = self._recorder.capture(lambda: self._body(at.iteration, placeholder))
+            launch, losses = self._recorder.capture(lambda: self._compute_step(at.iteration, placeholder))
         if self._fused.drops_parameter_terms():
             self._able = False
             return None
         return _Graph(launch, target, losses)
 
     @torch.no_grad()
-    def _body(self, iteration: int, placeholder: Any) -> Tensor:
+    def _compute_step(self, iteration: int, placeholder: Any) -> Tensor:
+        """Compute the step that is captured, on the placeholder. Return its total and L1 losses, (2,)."""
         run = self._run
         now = self._inputs[:NOW_WORDS]
         if run.gaussians.exposures.applied:

@@ -24,8 +24,8 @@ class Recorder:
         if self._keeper is None:
             self._pool, self._word = torch.cuda.graph_pool_handle(), torch.zeros(1, device=self._device)
             # Torch gives the pool's memory back once no graph uses it; the next capture would wait for it.
-            self._keeper, _ = self._graph_of(self._word.zero_)
-        graph, result = self._graph_of(body)
+            self._keeper, _ = self._record(self._word.zero_)
+        graph, result = self._record(body)
         return graph.replay, result
 
     def release(self) -> None:
@@ -39,7 +39,8 @@ class Recorder:
         most = torch.cuda.get_per_process_memory_fraction() * total
         return min(free, most - torch.cuda.memory_reserved(self._device)) < most / 4
 
-    def _graph_of(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+    def _record(self, body: Callable[[], Tensor]) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+        """Capture the launches of a function on the recorder's stream. Return the graph, and the function's result."""
         self._stream.wait_stream(torch.cuda.current_stream())
         with torch.cuda.stream(self._stream), _no_collection():
             # capture_begin allocates two words for the random generator. Where that fails, torch's destructor of the

@@ -67,6 +67,7 @@ class Speculation:
     """
 
     def __init__(self, device: torch.device, steps: "Replayed") -> None:
+        """Allocate the words in which the GPU counts, and the page-locked rows for its reports."""
         self._words = torch.zeros(6, dtype=torch.int64, device=device)
         self._reports = torch.zeros(_REPORTS, 6, dtype=torch.int64, pin_memory=True)
         self._numbers = list(self._reports.numpy())  # the same memory
@@ -106,21 +107,21 @@ class Speculation:
     @contextmanager
     def capacity(self, at: Iteration | None) -> Iterator[None]:
         """Give operators the capacity that an iteration's view needed before, or with None the largest of any view."""
-        OPERATORS.run_ahead_(self._words, self._capacity_of(at and _view(at)), self._reports)
+        OPERATORS.run_ahead_(self._words, self._choose_capacity(at and _view_key(at)), self._reports)
         try:
             yield
         finally:
             OPERATORS.run_ahead_(None, [], None)
 
-    def _capacity_of(self, view: Hashable | None) -> Capacity:
+    def _choose_capacity(self, view: Hashable | None) -> Capacity:
         """Return the capacity that a view needed before, with some spare; a new view gets that of the largest."""
         if not self._needed:
             return _FIRST
-        *lists, blocks = self._needed_by(view)
-        instances, slots, rows = map(_with_spare, lists)
-        return min(instances, _MOST), slots, min(rows, _MOST), _with_spare(blocks, _LEAST_BLOCKS)
+        *lists, blocks = self._find_needs(view)
+        instances, slots, rows = map(_add_spare, lists)
+        return min(instances, _MOST), slots, min(rows, _MOST), _add_spare(blocks, _LEAST_BLOCKS)
 
-    def _needed_by(self, view: Hashable | None) -> Capacity:
+    def _find_needs(self, view: Hashable | None) -> Capacity:
         return self._needed.get(view) or tuple(map(max, zip((0, 0, 0, 0), *self._needed.values(), strict=True)))
 
     def _report(self) -> list[int] | None:
@@ -132,7 +133,7 @@ class Speculation:
     def _finish(self, report: list[int]) -> None:
         """Take the first pending step off the list, and note its needs."""
         at = self._pending.popleft().at
-        self._needed[_view(at)] = tuple(report[:4])
+        self._needed[_view_key(at)] = tuple(report[:4])
         self._done += 1
 
     def _collect(self, most: int) -> None:
@@ -157,22 +158,22 @@ class Speculation:
         instances, slots, rows, blocks, _ = report
         if instances > _MOST:
             self._steps.measure(self._pending[0].at)  # raises an error: its lists are too long for any capacity
-        view = _view(self._pending[0].at)
+        view = _view_key(self._pending[0].at)
         if not instances:  # it overflowed with blocks, and counted nothing else
-            instances, slots, rows, _ = self._needed_by(view) if self._needed else _FIRST
+            instances, slots, rows, _ = self._find_needs(view) if self._needed else _FIRST
         # A step that overflowed with instances did not count its rows, of which there are no more.
         self._needed[view] = instances, slots, rows or instances, blocks
         for pending in self._pending:
             self._steps.replay(pending.at, pending.losses)
 
 
-def _with_spare(count: int, least: int = _LEAST) -> int:
+def _add_spare(count: int, least: int = _LEAST) -> int:
     """Return a little more than a count, in few different sizes, so that torch's allocator finds them again."""
     requested = max(int(_SPARE * count), least)
     unit = 1 << max(requested.bit_length() - 4, 0)
     return -(-requested // unit) * unit
 
 
-def _view(at: Iteration) -> Hashable:
+def _view_key(at: Iteration) -> Hashable:
     """Return the key of the view on which the capacity of a step depends."""
     return at.camera.uid, at.camera.image_width

@@ -71,7 +71,9 @@ def error_map(image: Tensor, target: Tensor, mask: Tensor | None = None, columns
     Each value is divided by the number of pixels that count, as in the mean of the photometric loss.
 
     image: (3, H, W) float32, not clamped.
-    target, mask, columns: as for `photometric_loss`.
+    target: (3, H, W), float32 in [0, 1] or uint8.
+    mask: (1, H, W) bool, pixels that count; None: all.
+    columns: columns that count; None: all.
     """
     if target.dtype == torch.uint8:
         target = target.float() / 255
@@ -82,12 +84,12 @@ def error_map(image: Tensor, target: Tensor, mask: Tensor | None = None, columns
         whole[..., columns] = errors
         return whole
     if mask is None:
-        return _mean((image - target).abs()) / image[0].numel()
+        return _average_channels((image - target).abs()) / image[0].numel()
     image, target = (torch.where(mask, x, 0.0) for x in (image, target))
-    return torch.where(mask, _mean((image - target).abs()), 0.0) / mask.sum().clamp_min(1)
+    return torch.where(mask, _average_channels((image - target).abs()), 0.0) / mask.sum().clamp_min(1)
 
 
-def _mean(errors: Tensor) -> Tensor:
+def _average_channels(errors: Tensor) -> Tensor:
     """Return the mean of three channels (3, H, W), in one order of summation: (1, H, W)."""
     red, green, blue = errors
     return ((red + green + blue) / 3)[None]

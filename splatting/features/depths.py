@@ -25,6 +25,11 @@ class Depths(Part):
     needs = Needs(depth=True, files=True, length=True)
 
     def dataset(self, info: SceneInfo, args: argparse.Namespace, fresh: bool) -> SceneInfo:
+        """Return the dataset with the depth maps of its training views, if it is read to train.
+
+        A saved model is rendered without depth maps, so its dataset stays as it is. So does the dataset of a reader of
+        other code, which finds the maps itself. UserError for maps that cannot be used.
+        """
         if not fresh or find_reader_replacement(kind_of(args.source_path)):  # which finds the maps itself
             return info
         info = with_depth_maps(info, Path(args.source_path), args.depths)

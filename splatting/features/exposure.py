@@ -31,6 +31,7 @@ class Exposure(Appearance):
         return info if by_other_code else train_on_all(info)
 
     def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
+        """Let test views train or be scored on one half of their columns, and name the exposures of renamed views."""
         scene.halves = True
         names, tested = names_of_photos(scene.info), {view.image_path for view in scene.info.test_cameras}
         for camera, view in cameras:

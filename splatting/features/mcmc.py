@@ -44,6 +44,7 @@ class Mcmc(Strategy):
         return few and run.device.type == "cuda"
 
     def begin(self, run: Any, state: Any) -> None:
+        """Choose rates, the largest number of Gaussians and penalties; new Gaussians become opaque and small."""
         super().begin(run, state)
         opt, paced, cameras = run.opt, run.schedule.paced, run.scene.getTrainCameras()
         self._rates = Rates(bands=band_rate(cameras))
@@ -67,7 +68,7 @@ class Mcmc(Strategy):
         if not at.density.densify:
             return ()
         count = gaussians.gaussian_count
-        moves = 0 < self._limit(iteration, count, 0) < count or self._grown(count, iteration) > count
+        moves = 0 < self._limit_count(iteration, count, 0) < count or self._next_count(count, iteration) > count
         moves = moves or gaussians.shards.ranks.any_rank(not is_alive(gaussians, least).all())
         return gaussians._attributes if moves else ()
 
@@ -88,24 +89,24 @@ class Mcmc(Strategy):
         """Move what nobody sees (the paper's relocation of dead Gaussians), or remove random points (`count_limit`)."""
         least = self._opt.mcmc_min_opacity
         count = self._gaussians.gaussian_count
-        if 0 < (most := self._limit(iteration, count, 0)) < count:
+        if 0 < (most := self._limit_count(iteration, count, 0)) < count:
             remove_useless(self._gaussians, least, most)
         dead = relocate(self._gaussians, least, seed=self._opt.seed, iteration=iteration)
         empty = dead == self._gaussians.gaussian_count
         refuse_empty(iteration, empty, "lower --mcmc_opacity_reg", f"with an opacity above {least} in")
 
     def _grow(self, iteration: int) -> None:
-        """Add Gaussians until there are as many as `_grown` says."""
+        """Add Gaussians until there are as many as `_next_count` says."""
         count = self._gaussians.gaussian_count
-        new = self._grown(count, iteration) - count
+        new = self._next_count(count, iteration) - count
         if new > 0:
             grow(self._gaussians, new, seed=self._opt.seed, iteration=iteration)
 
-    def _grown(self, count: int, iteration: int) -> int:
+    def _next_count(self, count: int, iteration: int) -> int:
         """Return the number after a growth: more by a share (the paper's rule of adding Gaussians), at least by one."""
         growth = self._opt.mcmc_growth
-        most = self._limit(iteration, count, self.max_gaussians)
+        most = self._limit_count(iteration, count, self.max_gaussians)
         return min(max(int((1 + growth) * count), count + (growth > 0)), most)
 
-    def _limit(self, iteration: int, count: int, limit: int) -> int:
+    def _limit_count(self, iteration: int, count: int, limit: int) -> int:
         return self.schedule.count_limit(iteration, count, limit, self.max_gaussians)

@@ -55,7 +55,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, *, seed: int, it
     counts = gaussians.shards.ranks.all_gather_host_ints(len(dead))[:, 0]
     count = int(counts.sum())
     if 0 < count < gaussians.gaussian_count:
-        draws, origins = _divide(gaussians, live, count, seed, iteration, _RELOCATION)
+        draws, origins = _draw_and_shrink(gaussians, live, count, seed, iteration, _RELOCATION)
         rows = gaussians.rows_at(origins)
         gaussians.table.overwrite(dead, gaussians.shards.send_draws(rows, draws, counts))
     return count
@@ -65,7 +65,7 @@ def relocate(gaussians: GaussianParameters, min_opacity: float, *, seed: int, it
 def grow(gaussians: GaussianParameters, count: int, *, seed: int, iteration: int) -> None:
     """Append `count` Gaussians, which are parts of others as `relocate` makes them."""
     every = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.raw("xyz").device)
-    draws, origins = _divide(gaussians, every, count, seed, iteration, _GROWTH)
+    draws, origins = _draw_and_shrink(gaussians, every, count, seed, iteration, _GROWTH)
     append_rows(gaussians, gaussians.rows_at(origins), origins)
     gaussians.shards.order_appended(draws)
 
@@ -86,12 +86,16 @@ def add_noise(gaussians: GaussianParameters, size: float, *, seed: int, iteratio
     add_noise_(gaussians.raw("xyz"), *shapes, **gate, **numbers, **where)
 
 
-def _divide(
+def _draw_and_shrink(
     gaussians: GaussianParameters, live: Tensor, count: int, seed: int, iteration: int, which: int
 ) -> tuple[Tensor, Tensor]:
-    """Draw the origins of `count` new Gaussians among those of `live`, and make each origin a part of what it was.
+    """Draw Gaussians that become several, and shrink each of them to one of its equal parts.
 
-    Return the draws (n,) that fell on this rank's Gaussians, and their origins (n,).
+    Return the draws (n,) that fell on this rank's Gaussians, ascending, and the rows (n,) that they fell on.
+
+    live: (N,) bool, the Gaussians that may be drawn, in proportion to their opacity.
+    count: number of draws over all ranks, one for each new part.
+    which: _RELOCATION or _GROWTH, for which the random numbers differ.
     """
     logits = gaussians.opacity_logits().reshape(-1)
     units = torch.where(live, opacity_units(logits), 0)
@@ -155,14 +159,14 @@ def divided(logits: Tensor, parts: Tensor) -> tuple[Tensor, Tensor]:
 
 def _weight(opacity: Tensor, parts: Tensor) -> Tensor:
     """Return the sum of `divided` for opacities p (n,)."""
-    table = _coefficients().to(opacity.device)
+    table = _make_coefficients().to(opacity.device)
     total = torch.zeros_like(opacity)
     for coefficients in table.flip(0):  # Horner's scheme, product and sum rounded one by one
         total = (total + coefficients[parts]) * opacity
     return total
 
 
-def _coefficients() -> Tensor:
+def _make_coefficients() -> Tensor:
     """Return C(N, k) (-1)^(k+1) / sqrt(k) in row k - 1 and column N, float64."""
     rows = [
         [math.comb(parts, k) * (-1) ** (k + 1) / math.sqrt(k) for parts in range(MOST_PARTS + 1)]

@@ -39,6 +39,7 @@ class Ppisp(Appearance):
     needs = Needs(captured=True, resets=False, length=True)  # length: for its learning rate
 
     def cameras(self, scene: Scene, cameras: Sequence[tuple[Camera, CameraInfo]], held_out: bool) -> None:
+        """Name the appearance by which each camera shows a render; held-out views have none that is trained."""
         names = names_of_photos(scene.info)
         for camera, view in cameras:
             if held_out:
@@ -47,6 +48,7 @@ class Ppisp(Appearance):
                 camera.exposure_name = name
 
     def begin(self, run: Any, state: Any) -> None:
+        """Give the model the appearance of its photos, or that of the checkpoint. UserError for a single photo."""
         views = run.scene.info.train_cameras
         if len(views) < 2:
             raise UserError("--appearance ppisp needs at least two training photos; leave it out")
@@ -60,7 +62,7 @@ class Ppisp(Appearance):
                 self.photos.restore(state)
 
     def terms(self, at: Iteration) -> dict[str, Term]:
-        return {"appearance": lambda *_: self.photos.pull(photo_name(at.camera))}
+        return {"appearance": lambda *_: self.photos.size_penalty(photo_name(at.camera))}
 
     def save(self, scene: Scene) -> None:
         scene.gaussians.save_exposures(scene.model_path)
@@ -94,6 +96,7 @@ def fitted_views(photos: PhotoAppearance, pipe: argparse.Namespace, background: 
     """
 
     def draw(camera: Camera, gaussians: GaussianModel) -> Tensor:
+        """Render a view (3, H, W), with exposure and balance fitted to the left half of its photo."""
         options = {"want_depth": False, "want_visibility": False, "clamp": False}
         image = render(camera, gaussians, pipe, background, **options)["render"]
         target, mask = camera.ground_truth(background)

@@ -117,12 +117,12 @@ class PhotoAppearance(Exposures):
     def photo(self, name: str | Tensor) -> Tensor:
         """Return a photo's exposure, red against blue, and both against green: (3,), stops from the mean of photos."""
         photos = self._read("photos")
-        return _row(photos, self.index(name)) - photos.detach().mean(0)
+        return _select_row(photos, self.index(name)) - photos.detach().mean(0)
 
     def _response(self, row: Tensor) -> Tensor:
         """Return the logarithms of the rises of a camera's response (3, 3), from their mean over all photos."""
         responses = self._read("response")
-        return _row(responses, row) - responses.detach()[self._row_of].mean(0)
+        return _select_row(responses, row) - responses.detach()[self._row_of].mean(0)
 
     def covers(self, name: str | None) -> bool:
         return name in self.mapping
@@ -132,13 +132,13 @@ class PhotoAppearance(Exposures):
 
         image: (3, H, W), not clamped.
         """
-        return self._seen(image, _gains(self.photo(name)), self._row_of.index_select(0, self.index(name)))
+        return self._show(image, _to_gains(self.photo(name)), self._row_of.index_select(0, self.index(name)))
 
-    def pull(self, name: str | Tensor) -> Tensor:
+    def size_penalty(self, name: str | Tensor) -> Tensor:
         """Return the loss term of a photo: sizes of the photo's numbers and its camera's, weighted and smoothed."""
         row = self._row_of.index_select(0, self.index(name))
         found = {"photos": self.photo(name), "response": self._response(row)}
-        found |= {kind: _row(self._read(kind), row) for kind in ("vignetting", "middle")}
+        found |= {kind: _select_row(self._read(kind), row) for kind in ("vignetting", "middle")}
         return sum(_ALL[kind][2] * square_root(numbers.square() + _SMALL**2).sum() for kind, numbers in found.items())
 
     @torch.no_grad()
@@ -155,14 +155,14 @@ class PhotoAppearance(Exposures):
         for _ in range(_FITS):
             with torch.enable_grad():
                 each = gains.expand_as(image).requires_grad_()
-                shown = self._seen(image, each, row).clamp(0, 1)
+                shown = self._show(image, each, row).clamp(0, 1)
                 (slope,) = torch.autograd.grad(shown.sum(), each)
             slope = torch.where(counts, slope, 0.0).double()
             change = (slope * (target - shown)).sum((1, 2), True) / slope.square().sum((1, 2), True).clamp_min(1e-12)
             gains = (gains + change.clamp(-1, 1).float()).clamp(-_FARTHEST, _FARTHEST)
-        return self._seen(image, gains, row).clamp(0, 1)
+        return self._show(image, gains, row).clamp(0, 1)
 
-    def _seen(self, image: Tensor, gains: Tensor, row: Tensor | None) -> Tensor:
+    def _show(self, image: Tensor, gains: Tensor, row: Tensor | None) -> Tensor:
         """Return a render as a camera shows it.
 
         gains: (3, 1, 1), of the channels, in stops.
@@ -171,8 +171,8 @@ class PhotoAppearance(Exposures):
         gains = _LN2 * gains  # the last bit of torch.exp2 depends on the number of threads
         if row is None:
             return image * exponential(gains)
-        right, down = _places(*image.shape[-2:], image.device)
-        middle, falloff = (_row(self._read(kind), row) for kind in ("middle", "vignetting"))
+        right, down = _pixel_places(*image.shape[-2:], image.device)
+        middle, falloff = (_select_row(self._read(kind), row) for kind in ("middle", "vignetting"))
         a, b = (_LN2 * falloff[..., None, None]).unbind(1)
         square = (right - middle[:1]).square()[None, :] + (down - middle[1:]).square()[:, None]
         x = image * exponential(gains + square * (a + (3 * square - 1.5) * b))
@@ -188,6 +188,10 @@ class PhotoAppearance(Exposures):
     # Training, checkpoints and the file
 
     def training_setup(self, opt: argparse.Namespace) -> None:
+        """Make the numbers trainable, with an optimiser and the schedule of its rates.
+
+        opt: options, of which `iterations` is the length of the schedule.
+        """
         self.numbers = {name: trainable(values) for name, values in self.numbers.items()}
         groups = [{"params": [values], "lr": _ALL[name][1], "name": name} for name, values in self.numbers.items()]
         self.optimizer = GaussianAdam(groups)
@@ -217,6 +221,7 @@ class PhotoAppearance(Exposures):
         return {**known, "numbers": values, "optimizer": self.optimizer.state_dict()}
 
     def take_values(self, state: dict[str, Any]) -> None:
+        """Take the numbers of a state that `capture` has returned. UserError if they are of other photos or cameras."""
         found = state.get("numbers")
         fits = isinstance(found, dict) and state.get("cameras") == self.cameras
         for name, values in self.numbers.items():
@@ -227,6 +232,11 @@ class PhotoAppearance(Exposures):
                 values.copy_(given)
 
     def check_finite(self, where: str, remedy: str) -> None:
+        """Raise UserError with the first photo or camera that has a number which is not finite.
+
+        where: name of the file that the numbers are in or for, for the message.
+        remedy: advice that ends the message.
+        """
         for name, values in self.numbers.items():
             finite = values.detach().isfinite().flatten(1).all(dim=1)
             if not finite.all():
@@ -271,18 +281,18 @@ def read_appearance(folder: str | os.PathLike, views: Sequence[CameraInfo]) -> P
     return appearance
 
 
-def _row(values: Tensor, index: Tensor) -> Tensor:
+def _select_row(values: Tensor, index: Tensor) -> Tensor:
     return values.index_select(0, index)[0]
 
 
-def _gains(photo: Tensor) -> Tensor:
+def _to_gains(photo: Tensor) -> Tensor:
     """Return the stops (3, 1, 1) of red, green and blue by the numbers of a photo."""
     exposure, red, others = photo.unbind()
     return torch.stack([exposure + red + others, exposure - 2 * others, exposure - red + others])[:, None, None]
 
 
 @cache
-def _places(height: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def _pixel_places(height: int, width: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return the places of columns and rows from the middle of an image, in half diagonals."""
     half = 0.5 * (height**2 + width**2) ** 0.5
     with torch.inference_mode(False):  # so that training can use them after a render in inference mode

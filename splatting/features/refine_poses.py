@@ -97,10 +97,17 @@ def with_poses(info: SceneInfo, folder: str | os.PathLike) -> SceneInfo:
     except (TypeError, ValueError, RecursionError) as error:
         raise UserError(f"{path} is no table of poses; {_REMEDY}") from error
     lists = {name: getattr(info, f"{name}_cameras") for name in ("train", "test")}
-    return info._replace(**{f"{name}_cameras": _placed(views, table.get(name), path) for name, views in lists.items()})
+    return info._replace(
+        **{f"{name}_cameras": _place_views(views, table.get(name), path) for name, views in lists.items()}
+    )
 
 
-def _placed(views: Sequence[CameraInfo], entries: Any, path: Path) -> list[CameraInfo]:
+def _place_views(views: Sequence[CameraInfo], entries: Any, path: Path) -> list[CameraInfo]:
+    """Return the views with the poses of a list in poses.json. UserError for a list that does not fit the views.
+
+    entries: list of tables with img_name, R (3, 3) and T (3,); it may be anything else if the file is damaged.
+    path: file of the list, for messages.
+    """
     names = [view.image_name for view in views]
     try:
         if [entry["img_name"] for entry in entries] != names:

@@ -76,12 +76,12 @@ class PoseRefinement:
         """Give all cameras their current poses; or only one training camera, and a smaller copy of it."""
         views = self._moved.copy() if copy is None else self._moved & {copy.uid}
         for view in views:
-            self._put(self._cameras[view], view)
+            self._place_one(self._cameras[view], view)
         self._moved -= views
         if copy is not None and copy is not self._cameras[copy.uid]:
-            self._put(copy, copy.uid)
+            self._place_one(copy, copy.uid)
 
-    def _put(self, camera: Camera, view: int) -> None:
+    def _place_one(self, camera: Camera, view: int) -> None:
         pose = self._pose(view)
         camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
 
@@ -200,7 +200,9 @@ class TrackedPoses:
         """Find the poses.
 
         given: the dataset's poses.
-        tracks, focals, unit: as for `pose_loss` (scene/reprojection.py).
+        tracks: points that each view shows, or None.
+        focals: focal lengths of the views, pixels.
+        unit: length of the twists' unit of translation, in world units.
         """
         self.starts, self.held = [], []
         for pose, track, focal in zip(given, tracks, focals, strict=True):

@@ -33,6 +33,7 @@ class RobustMask(Part):
     needs = Needs(ranks=False)
 
     def begin(self, run: Any, state: Any) -> None:
+        """Begin with the residuals of a checkpoint, or with none, and filter the pixels of the loss by them."""
         self._run = run
         self.residuals = Residuals(run.scene.getTrainCameras(), run.opt.robust_mask, run.device)
         if state is not None:

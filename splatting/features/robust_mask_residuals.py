@@ -61,6 +61,11 @@ class Residuals:
     early: ClassVar[int] = 5
 
     def __init__(self, cameras: Sequence[Camera], share: float, device: torch.device) -> None:
+        """Begin without any residual.
+
+        cameras: training cameras.
+        share: largest share of a photo that is masked, 0 to 1.
+        """
         self.cameras = sorted(cameras, key=lambda camera: camera.uid)
         count = len(cameras)
         self._below = CELLS**2 - math.floor(share * CELLS**2)
@@ -78,51 +83,51 @@ class Residuals:
         uid, self._next = camera.uid, None
         found = self.residuals[uid]
         if learns:
-            newest = _in_cells(image, target, mask)
+            newest = _average_cells(image, target, mask)
             found = torch.lerp(found, newest, _NEWEST) if self.visits[uid] else newest
             self._next = uid, found
         if self.visits[uid] < self.least or (learns and self.visits[uid] % _UNMASKED == _UNMASKED - 1):
             return mask
-        counts = self._counts(uid, found, image.shape[-2:])
+        counts = self._unmasked_pixels(uid, found, image.shape[-2:])
         return counts if mask is None else mask if counts is None else counts & mask
 
     def keep(self) -> None:
         """Keep the residuals of a step that is taken."""
         if self._next is not None:
             uid, found = self._next
-            self.residuals[uid], self.levels[uid], self._next = found, self._level(found), None
+            self.residuals[uid], self.levels[uid], self._next = found, self._find_level(found), None
             self.visits[uid] += 1
 
-    def _level(self, residuals: Tensor) -> Tensor:
+    def _find_level(self, residuals: Tensor) -> Tensor:
         return residuals.flatten().kthvalue(self._below).values
 
-    def _limit(self, uid: int, factor: float) -> Tensor:
+    def _outlier_limit(self, uid: int, factor: float) -> Tensor:
         return factor * (1 + self.early / int(self.visits[uid])) * self.levels.nanmedian()
 
-    def _outliers(self, uid: int, residuals: Tensor) -> Tensor:
+    def _find_outliers(self, uid: int, residuals: Tensor) -> Tensor:
         """Return the cells far beyond the level of all photos, without small groups; the largest if there are many."""
-        outliers = residuals > self._limit(uid, _FACTOR)
+        outliers = residuals > self._outlier_limit(uid, _FACTOR)
         around = {"kernel_size": _AROUND, "stride": 1, "padding": _AROUND // 2}
         most = avg_pool2d(outliers[None].float(), **around, count_include_pad=False) > 0.5
         near = max_pool2d((most & outliers).float(), **around)[0] > 0
-        return outliers & near & (residuals > self._level(residuals))
+        return outliers & near & (residuals > self._find_level(residuals))
 
-    def _counts(self, uid: int, residuals: Tensor, size: Sequence[int]) -> Tensor | None:
+    def _unmasked_pixels(self, uid: int, residuals: Tensor, size: Sequence[int]) -> Tensor | None:
         """Return all pixels but those of outliers and of cells beside outliers, (1, H, W) bool; None if all count."""
-        beside = max_pool2d(self._outliers(uid, residuals)[None].float(), 3, stride=1, padding=1)[0] > 0
-        masked = beside & (residuals > self._limit(uid, _BESIDE)) & (residuals > self._level(residuals))
+        beside = max_pool2d(self._find_outliers(uid, residuals)[None].float(), 3, stride=1, padding=1)[0] > 0
+        masked = beside & (residuals > self._outlier_limit(uid, _BESIDE)) & (residuals > self._find_level(residuals))
         return interpolate(masked[None, None].float(), size=tuple(size))[0] == 0 if masked.any() else None
 
     def counted(self, camera: Camera) -> Tensor | None:
         """Return the pixels of a view that are not masked now, (1, H, W) bool; None: no mask, as in test views."""
         if camera not in self.cameras or self.visits[camera.uid] < self.least:
             return None
-        return self._counts(camera.uid, self.residuals[camera.uid], (camera.image_height, camera.image_width))
+        return self._unmasked_pixels(camera.uid, self.residuals[camera.uid], (camera.image_height, camera.image_width))
 
     def difference(self, camera: Camera) -> float:
         """Return the mean residual of a view's outliers, in [0, 1]; 0 without any."""
         residuals = self.residuals[camera.uid]
-        return float(residuals[self._outliers(camera.uid, residuals)].mean().nan_to_num())
+        return float(residuals[self._find_outliers(camera.uid, residuals)].mean().nan_to_num())
 
     def captured(self) -> dict[str, Any]:
         """Return the state that a resumed training needs, as plain values."""
@@ -157,7 +162,7 @@ def odd_share(masks: Residuals) -> float:
     return fmean(masks.difference(camera) > CLEAR for camera in masks.cameras)
 
 
-def _in_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
+def _average_cells(image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
     """Return the absolute mean difference of a render and its photo in the cells, smoothed; 0 where no pixel counts.
 
     The result is (CELLS, CELLS).

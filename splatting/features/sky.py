@@ -31,6 +31,7 @@ class Sky(Part):
         return True
 
     def begin(self, run: Any, state: Any) -> None:
+        """Add a sky to a new training, or take that of the checkpoint, and keep density control off its Gaussians."""
         self._run = run
         if state is not None:
             self.shell = resumed_shell(state, run.scene)

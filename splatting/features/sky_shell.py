@@ -50,10 +50,15 @@ class Shell:
         """Return the depths of the sky's pixels in a view, each for the pixels around it; None if there are none."""
         key = camera.uid, camera.image_width, camera.image_height
         if key not in self._known:
-            self._known[key] = self._depths(camera, scene.info.train_cameras[camera.uid], scene.cameras_extent)
+            self._known[key] = self._find_depths(camera, scene.info.train_cameras[camera.uid], scene.cameras_extent)
         return self._known[key]
 
-    def _depths(self, camera: Camera, view: CameraInfo, extent: float) -> PointDepths | None:
+    def _find_depths(self, camera: Camera, view: CameraInfo, extent: float) -> PointDepths | None:
+        """Return inverse depths and weights of the pixels of a view that show a point of the sky; None without any.
+
+        view: record that the camera was made from.
+        extent: extent of the scene, in world units.
+        """
         if not len(self.points):
             return None
         x, y, inside = projected(view, self.points)
@@ -96,9 +101,9 @@ class Shell:
 
         means: (N, 3).
         """
-        return self._distances2(means) > (0.5 * self.radius) ** 2
+        return self._squared_distances(means) > (0.5 * self.radius) ** 2
 
-    def _distances2(self, means: Tensor) -> Tensor:
+    def _squared_distances(self, means: Tensor) -> Tensor:
         x, y, z = (means - means.new_tensor(self.center)).unbind(1)
         return x * x + y * y + z * z
 
@@ -107,7 +112,7 @@ class Shell:
         """Put the sky's Gaussians back on the sphere, and shrink those that a split could send away from it."""
         means, scales = gaussians.raw("xyz"), gaussians.raw("scaling")
         far, center = self.rows(means)[:, None], means.new_tensor(self.center)
-        factor = self.radius / square_root(self._distances2(means))
+        factor = self.radius / square_root(self._squared_distances(means))
         means.copy_(torch.where(far, center + (means - center) * factor[:, None], means))
         largest = math.log(_WIDEST * self.radius)
         scales.copy_(torch.where(far, gaussians.raw_scaling(gaussians.log_scales().clamp_max(largest)), scales))
@@ -201,11 +206,11 @@ def find_directions(scene: Scene, center: list[float], radius: float) -> tuple[B
     photos agree better on a surface nearer by.
     """
     info = scene.info
-    photos = [_photo(camera, info.train_cameras[camera.uid], info.point_cloud.points)
+    photos = [_read_cells(camera, info.train_cameras[camera.uid], info.point_cloud.points)
               for camera in sorted(scene.getTrainCameras(), key=lambda camera: camera.uid)]  # fmt: skip
-    toward = _directions(info.train_cameras)
+    toward = _spread_directions(info.train_cameras)
     shell, height = center + radius * toward, toward @ up_of(np.stack([view.R for view in info.train_cameras]))
-    seen = _look(photos, shell)
+    seen = _collect_sights(photos, shell)
     alike, several = np.sqrt(seen.squares) < ALIKE, seen.photos > 1
     free = (seen.photos > 0) & (seen.taken[0] == 0) & alike & (height > _BELOW)
     colors = seen.colors[free].astype(np.float32)
@@ -219,16 +224,16 @@ def find_directions(scene: Scene, center: list[float], radius: float) -> tuple[B
 
 def _is_near(photos: list[_Photo], center: list[float], toward: np.ndarray, radius: float, extent: float) -> bool:
     """Tell whether photos agree better on directions without points if these show something near."""
-    far = _look(photos, center + radius * toward, without_points=True)
+    far = _collect_sights(photos, center + radius * toward, without_points=True)
     for times in _NEARER:
-        near = _look(photos, center + times * extent * toward, without_points=True)
+        near = _collect_sights(photos, center + times * extent * toward, without_points=True)
         both = (far.photos > 1) & (near.photos > 1)
         if both.any() and near.squares[both].mean() + _NOISE < _BETTER * (far.squares[both].mean() + _NOISE):
             return True
     return False
 
 
-def _look(photos: list[_Photo], places: np.ndarray, without_points: bool = False) -> _Seen:
+def _collect_sights(photos: list[_Photo], places: np.ndarray, without_points: bool = False) -> _Seen:
     """Collect the colours and points of the photos at places (N, 3).
 
     without_points: true to leave out places near points of a photo.
@@ -252,7 +257,7 @@ def _look(photos: list[_Photo], places: np.ndarray, without_points: bool = False
     return _Seen(shown, taken, smooth, color, np.maximum(square - color**2, 0).mean(1))
 
 
-def _directions(views: list[CameraInfo]) -> np.ndarray:
+def _spread_directions(views: list[CameraInfo]) -> np.ndarray:
     """Return unit vectors (N, 3) all around, ACROSS over the width of a photo: a Fibonacci lattice (Gonzalez 2010)."""
     apart = float(np.median([view.width / view.fx for view in views])) / ACROSS
     count = min(int(4 * math.pi / (0.75**0.5 * apart**2)), _MOST)
@@ -262,7 +267,7 @@ def _directions(views: list[CameraInfo]) -> np.ndarray:
     return np.stack([across * np.cos(turn), height, across * np.sin(turn)], axis=1)
 
 
-def _photo(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
+def _read_cells(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
     """Return a photo in cells, ACROSS over its width; a cell counts if all its pixels count and are opaque."""
     black = torch.zeros(3, device=camera.device)
     image, counted = camera.ground_truth(black)
@@ -278,10 +283,10 @@ def _photo(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
     mean, square = (avg_pool2d(values[None], 3, 1, 1, count_include_pad=False)[0] for values in (cells, cells**2))
     smooth = (square - mean**2).mean(0) < _SMOOTH**2
     counts, smooth = (values.cpu().numpy() for values in (counts[0] == 1, smooth))
-    return _Photo(view, cells.permute(1, 2, 0).cpu().numpy(), counts, _near_points(view, points), smooth)
+    return _Photo(view, cells.permute(1, 2, 0).cpu().numpy(), counts, _find_near_points(view, points), smooth)
 
 
-def _near_points(view: CameraInfo, points: np.ndarray) -> np.ndarray:
+def _find_near_points(view: CameraInfo, points: np.ndarray) -> np.ndarray:
     """Return the cells of a photo with a point near by, as near as _AROUND and _SPACINGS say, (2, h, w) bool."""
     cells = np.zeros((max(view.height * ACROSS // view.width, 1), ACROSS), dtype=bool)
     x, y, inside = projected(view, points.astype(np.float64))

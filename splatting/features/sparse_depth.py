@@ -20,6 +20,7 @@ class SparseDepth(Part):
     needs = Needs(depth=True, ranks=False, files=True)
 
     def begin(self, run: Any, state: Any) -> None:
+        """Read the tracks of the training photos. UserError for a scene without tracks."""
         source, self._views = run.dataset.source_path, run.scene.info.train_cameras
         self._options = {"weight": run.opt.sparse_depth, "enlargement": run.gaussians.enlargement}
         self._tracks = read_tracks(source, self._views, run.scene.info.offset)

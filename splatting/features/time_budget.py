@@ -39,6 +39,7 @@ class TimeBudget(Part):
 
     @classmethod
     def joins_by_state(cls, given: argparse.Namespace, iteration: int) -> bool:
+        """Print a warning that this run continues by --iterations, not by the checkpoint's schedule; return False."""
         print(
             f"warning: {given.start_checkpoint} was trained with --time_budget or --schedule; this run has neither and "
             f"continues at iteration {iteration} of --iterations {given.iterations}",
@@ -53,6 +54,7 @@ class TimeBudget(Part):
         return self._schedule
 
     def begin(self, run: Any, state: Any) -> None:
+        """Tell the schedule about photos, points and device, and let it choose the size of views."""
         schedule, cameras = run.schedule, run.scene.getTrainCameras()
         schedule.random = run.scene.info.has_random_points
         schedule.short = SHORT[run.device.type]
@@ -84,6 +86,11 @@ class Sizes:
     """
 
     def __init__(self, schedule: DecidedSchedule, images: ImageStore) -> None:
+        """Begin with views in their own size.
+
+        schedule: schedule that tells the factor of sizes at each of its steps.
+        images: store of the photos, whose size tells whether smaller views can be kept.
+        """
         self.factor = 1.0
         self._schedule = schedule
         self._images = images
@@ -102,7 +109,7 @@ class Sizes:
         """Return a view in its size at an iteration of the schedule. Call this in ascending order of iterations."""
         factor = self.factor_at(schedule_step)
         if factor != self.factor:
-            self._begin(factor)
+            self._change_factor(factor)
         if not self._shrinks(camera):
             return camera
         found = self._made.get(camera)
@@ -121,7 +128,8 @@ class Sizes:
             return False
         return smaller(camera, self.factor) != (camera.image_width, camera.image_height)
 
-    def _begin(self, factor: float) -> None:
+    def _change_factor(self, factor: float) -> None:
+        """Forget the smaller views so far, and decide whether those of a new factor are kept."""
         self.factor = factor
         self._made.clear()
         free = free_memory(torch.device(self._images.device))

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from tqdm import tqdm
 
-from splatting.schedule import Schedule, longer_steps
+from splatting.schedule import Schedule, stride_rate_factor
 
 _PACE = 5  # blocks that tell the pace of a run
 _ROUNDING = 1e-6  # iterations of the schedule; progress is a float, and just below a whole number counts as that
@@ -82,6 +82,7 @@ class DecidedSchedule(Schedule):
     _told = False
 
     def __init__(self, decided: Decided) -> None:
+        """Follow decisions of an earlier run, from the first block on."""
         super().__init__(decided.iterations)
         self._decided = decided
         self.blocks = list(decided.blocks)
@@ -94,10 +95,11 @@ class DecidedSchedule(Schedule):
         """Return the part of the schedule that is done after an iteration, 0 to 1."""
         if iteration <= 0:
             return 0.0
-        index, block = self._block(iteration)
-        return block.start + block.step * (iteration - self._last(index))
+        index, block = self._find_block(iteration)
+        return block.start + block.step * (iteration - self._end_before(index))
 
     def schedule_step(self, iteration: int) -> int:
+        """Return the step of the schedule, 0 to `length`, of an iteration; `length` only where a run ends."""
         if iteration <= 0:
             return 0
         # The end of the schedule is only reached in a last iteration.
@@ -111,7 +113,7 @@ class DecidedSchedule(Schedule):
         return int(AGAIN * self.length) if self.rests(iteration) else self.schedule_step(iteration)
 
     def stride(self, iteration: int) -> float:
-        return self._block(iteration)[1].step * self.length
+        return self._find_block(iteration)[1].step * self.length
 
     @property
     def possible_levels(self) -> Levels:
@@ -129,7 +131,7 @@ class DecidedSchedule(Schedule):
         Blocks before this iteration tell that pace, except those with smaller views. Where no block tells it, return
         the number of iterations at the present stride.
         """
-        index, present = self._block(iteration)
+        index, present = self._find_block(iteration)
         spans = zip([0, *(block.last for block in self.blocks)], self.blocks[:index], self.blocks[1:], strict=False)
         speeds = [
             (after.seconds - block.seconds) / (block.last - before)
@@ -146,11 +148,11 @@ class DecidedSchedule(Schedule):
         trained = max(int(self.an_iteration * possible), 1)
         if limit and trained >= limit:
             return limit
-        self._tell(int(possible), trained, aim)
+        self._report_limit(int(possible), trained, aim)
         most = trained if self.random else max(trained, count)
         return min(limit, most) if limit else most
 
-    def _tell(self, iterations: int, trained: int, aim: int) -> None:
+    def _report_limit(self, iterations: int, trained: int, aim: int) -> None:
         """Print once how many Gaussians a time budget can train."""
         if not self._told:
             self._told = True
@@ -165,14 +167,14 @@ class DecidedSchedule(Schedule):
     def best_strategy(self, run: Any, strategies: Sequence[Any]) -> str:
         return self.strategy or super().best_strategy(run, strategies)
 
-    def nothing_left(self, checkpoint: str, iteration: int) -> str:
+    def nothing_left_message(self, checkpoint: str, iteration: int) -> str:
         return (
             f"{checkpoint} is at iteration {iteration}, and its schedule ends at {self.ends}; there is nothing left to "
             "train"
         )
 
     def rate_factor(self, iteration: int) -> float:
-        return longer_steps(self.usual_stride(iteration), self.progress(iteration))
+        return stride_rate_factor(self.usual_stride(iteration), self.progress(iteration))
 
     def known(self, planned: Sequence[int]) -> list[int]:
         return [self.ends] if self.ends is not None and self.length in planned else []
@@ -185,15 +187,15 @@ class DecidedSchedule(Schedule):
 
     def up_to(self, iteration: int) -> Decided:
         """Return the schedule of a run that went no further than an iteration."""
-        index, block = self._block(iteration)
+        index, block = self._find_block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
         return self.decided._replace(blocks=blocks, ended=iteration if self.is_last(iteration) else None)
 
-    def _block(self, iteration: int) -> tuple[int, Block]:
+    def _find_block(self, iteration: int) -> tuple[int, Block]:
         index = bisect_left(self.blocks, iteration, key=lambda block: block.last)
         return index, self.blocks[index]
 
-    def _last(self, index: int) -> int:
+    def _end_before(self, index: int) -> int:
         """Return the last iteration before a block."""
         return self.blocks[index - 1].last if index else 0
 
@@ -213,6 +215,7 @@ class TimeBudget(DecidedSchedule):
     by_clock = True
 
     def __init__(self, decided: Decided, share: Callable[[float], float] = lambda seconds: seconds) -> None:
+        """Continue the blocks of the runs that are resumed; a new run has none."""
         super().__init__(decided)
         self._share = share
         self._limit = decided.continued[-1].seconds if decided.continued else decided.time_budget
@@ -247,20 +250,24 @@ class TimeBudget(DecidedSchedule):
         return (self.begun or 0.0) + self._limit
 
     def reach(self, iteration: int, seconds: float) -> None:
+        """Decide the next block of iterations once the last one is over, and at first the sizes of views.
+
+        seconds: seconds of training before the iteration.
+        """
         if not self.blocks or iteration > self.blocks[-1].last:
             seconds = round(self._share(seconds), 6)
             if self.begun is None or seconds < self.begun:  # the log of those before may be lost
                 self.begun = seconds
-            self._measure(seconds)
+            self._measure_speed(seconds)
             if self._open and self._measured > 2 and seconds - self.begun > _KNOWN * self._limit:
                 self._choose_sizes(iteration - 1, seconds)
-            self._decide(seconds)
+            self._add_block(seconds)
 
-    def _measure(self, seconds: float) -> None:
+    def _measure_speed(self, seconds: float) -> None:
         """Measure the speed of the last block, if this run has taken it."""
         if not self.blocks or self.blocks[-1].last == self._first:
             return
-        block, before = self.blocks[-1], self._last(len(self.blocks) - 1)
+        block, before = self.blocks[-1], self._end_before(len(self.blocks) - 1)
         speed = max(seconds - block.seconds, 1e-9) / (block.last - before)
         self._measured += 1
         # The first iteration loads kernels and photos, so it is no measure of the others.
@@ -281,13 +288,13 @@ class TimeBudget(DecidedSchedule):
             begun = [factor for start, factor in PYRAMID if start <= now][-1]
             self.levels = ((now, begun), *(level for level in PYRAMID if level[0] > now))
 
-    def _decide(self, seconds: float) -> None:
+    def _add_block(self, seconds: float) -> None:
         """Add the next block."""
         before = self.blocks[-1].last if self.blocks else 0
         done = AGAIN if self.rests(before) else self.progress(before)
-        iterations = self._iterations(seconds - self.begun, (1.0 - done) / (1.0 - AGAIN if self._rests else 1.0))
+        iterations = self._count_left(seconds - self.begun, (1.0 - done) / (1.0 - AGAIN if self._rests else 1.0))
         self._expected = before + iterations if self._speeds else None
-        count, final = self._count(iterations)
+        count, final = self._size_block(iterations)
         if final:
             step = (1.0 - done) / count
             self.ends = before + count
@@ -303,7 +310,7 @@ class TimeBudget(DecidedSchedule):
                 file=sys.stderr,
             )
 
-    def _iterations(self, seconds: float, undone: float) -> float:
+    def _count_left(self, seconds: float, undone: float) -> float:
         """Return the number of iterations that the run has yet to take, infinite where no speed is known.
 
         seconds: seconds of the limit that have passed.
@@ -324,7 +331,7 @@ class TimeBudget(DecidedSchedule):
         usual = statistics.median_low(self._speeds) / self._limit  # part of that, of an iteration
         return max(left / self._speed, math.ceil(undone / (_MOST_SHARE * usual)))
 
-    def _count(self, iterations: float) -> tuple[int, bool]:
+    def _size_block(self, iterations: float) -> tuple[int, bool]:
         """Return the number of iterations of the next block, and whether the run ends with it.
 
         iterations: number of iterations that are left.
@@ -335,7 +342,7 @@ class TimeBudget(DecidedSchedule):
             return 1, False
         if self._measured == 1:
             return 1, iterations < 0.5
-        previous = self.blocks[-1].last - self._last(len(self.blocks) - 1)
+        previous = self.blocks[-1].last - self._end_before(len(self.blocks) - 1)
         block = max(1.0, min(_MOST_GROWTH * previous, PART * self._limit / self._speed))
         if iterations < _LAST * block:
             return max(1, int(iterations + 0.5)), True

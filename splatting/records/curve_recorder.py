@@ -77,7 +77,7 @@ def drawn(views: Sequence[View], count: int) -> list[View]:
     return [views[index] for index in sorted(indices[:count])]
 
 
-def _means(name: str, of_views: Sequence[Mapping[str, float]]) -> dict[str, float]:
+def _mean_scores(name: str, of_views: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """Return the mean of each score over the views of a set that have the score, by column."""
     kinds = dict.fromkeys(kind for scores in of_views for kind in scores)
     return {f"{name}_{kind}": round(fmean(x[kind] for x in of_views if kind in x), 6) for kind in kinds}
@@ -173,6 +173,11 @@ class CurveRecorder:
         device: torch.device,
         steady: bool = True,
     ) -> None:
+        """Plan the points, unless the number of iterations is not known yet.
+
+        model_path: model folder, into which curve and figure are written.
+        device: device that trains, whose work is done before a score begins.
+        """
         self.rows = rows
         self._folder = Path(model_path)
         self._log = log
@@ -210,7 +215,7 @@ class CurveRecorder:
         self._part = {name: drawn(self._all[name], size) for name in sets} if between else {}
         self._points = self._whole | between
 
-    def _subset(self, part: Mapping[str, Sequence[int]]) -> int | None:
+    def _subset_size(self, part: Mapping[str, Sequence[int]]) -> int | None:
         """Return the number of test views in a part of the sets, None if it has all of them."""
         return len(part["test"]) if len(part["test"]) < len(self._all["test"]) else None
 
@@ -258,19 +263,21 @@ class CurveRecorder:
             "peak_memory_mib": max((peak for peak in peaks if peak is not None), default=None),
         }
         if not self._scored:  # photos that training mostly needs soon: no part of the cost
-            self._timed("loading", lambda: self._load([view for of_set in self._views.values() for view in of_set]))
+            self._measure_time(
+                "loading", lambda: self._load([view for of_set in self._views.values() for view in of_set])
+            )
         whole = iteration in self._whole
         parts = [self._all] if whole else [self._part]
-        if whole and self._part and self._subset(self._part) is not None:
+        if whole and self._part and self._subset_size(self._part) is not None:
             parts.insert(0, self._part)
-        self._timed("scoring", lambda: self._score(row, parts))
+        self._measure_time("scoring", lambda: self._score(row, parts))
         self._scored += 1
         self._scored_in_part += self.rows[-1][SUBSET] is not None
-        self._timed("writing", self._write)
+        self._measure_time("writing", self._write)
         if iteration == self._iterations and writes_files():
             self._drawer.draw()
 
-    def _timed(self, part: str, call: Callable[[], object]) -> None:
+    def _measure_time(self, part: str, call: Callable[[], object]) -> None:
         start = running_seconds()
         call()
         self._spent[part] += running_seconds() - start
@@ -279,12 +286,13 @@ class CurveRecorder:
         """Add a row for each of the parts, the last of which has all views of the others."""
         scores = {name: {i: self._scores(self._views[name][i]) for i in of_set} for name, of_set in parts[-1].items()}
         for part in parts:
-            means = {SUBSET: self._subset(part)}
+            means = {SUBSET: self._subset_size(part)}
             for name, indices in part.items():
-                means |= _means(name, [scores[name][i] for i in indices])
+                means |= _mean_scores(name, [scores[name][i] for i in indices])
             self.rows.append(row | means)
 
     def _write(self) -> None:
+        """Write the file of the curve. The first failure is a warning, and the training goes on."""
         try:
             write_curve(self._folder / NAME, self.rows)
         except UserError as error:
@@ -299,10 +307,11 @@ class CurveRecorder:
         `curve_drawing_seconds` (of waiting), and `curve_loading_seconds` (of photos, before the first scoring).
 
         seconds: seconds of training in this run.
-        saved, steady: as for `peak_advice`.
+        saved: iterations whose PLY this training has written; advice on one of them is to render it.
+        steady: true if another training has the same iterations, so that advice may name one to save; not by the clock.
         """
         if writes_files():
-            self._timed("drawing", self._draw)
+            self._measure_time("drawing", self._draw)
         costs = {f"curve_{part}_seconds": round(taken, 4) for part, taken in self._spent.items()}
         self._log.add(self.rows[-1]["iteration"], seconds, **costs)
         often = "once" if self._scored == 1 else f"{self._scored} times"

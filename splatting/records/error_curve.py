@@ -43,11 +43,11 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     subset: number of views of each set that were scored, the same views in all rows of that number; None: all.
     """
     try:
-        header, *lines = _lines(path)
+        header, *lines = _read_lines(path)
         if header[: len(_OLDEST)] != list(_OLDEST):
             raise ValueError("its columns are different")
-        measured = _without(_ESTIMATED, header, lines)
-        rows = [_row(header, line, COLUMNS, ("iteration", "seconds"), COUNTS) for line in measured]
+        measured = _drop_lines(_ESTIMATED, header, lines)
+        rows = [_parse_row(header, line, COLUMNS, ("iteration", "seconds"), COUNTS) for line in measured]
         places = [(row["iteration"], math.inf if row[SUBSET] is None else row[SUBSET]) for row in rows]
         if places != sorted(set(places)):
             raise ValueError("its iterations do not ascend")
@@ -58,18 +58,18 @@ def read_curve(path: str | os.PathLike) -> list[Row]:
     return rows
 
 
-def _lines(path: str | os.PathLike) -> list[list[str]]:
+def _read_lines(path: str | os.PathLike) -> list[list[str]]:
     """Return the lines of a CSV file as lists of stripped fields, the header first."""
     with open(path, encoding=encoding_of(path), newline="") as file:
         return [[field.strip() for field in line] for line in csv.reader(file, strict=True) if line] or [[]]
 
 
-def _without(name: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> list[Sequence[str]]:
+def _drop_lines(name: str, header: Sequence[str], lines: Iterable[Sequence[str]]) -> list[Sequence[str]]:
     """Return the lines whose field in the column `name` is empty."""
     return [line for line in lines if not dict(zip(header, line, strict=True)).get(name)]
 
 
-def _row(
+def _parse_row(
     header: Sequence[str], line: Sequence[str], columns: Sequence[str], required: Sequence[str], counts: Sequence[str]
 ) -> Row:
     """Return a line's values of `columns`, None for empty fields.
@@ -89,7 +89,7 @@ def _row(
     return row
 
 
-def _write(path: str | os.PathLike, columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
+def _write_lines(path: str | os.PathLike, columns: Sequence[str], lines: Iterable[Sequence[Any]]) -> None:
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *lines])
 
@@ -97,7 +97,7 @@ def _write(path: str | os.PathLike, columns: Sequence[str], lines: Iterable[Sequ
 def write_curve(path: str | os.PathLike, rows: list[Row]) -> None:
     """Write rows that have all COLUMNS. A value that is None or not finite (PSNR of equal images) is left empty."""
     values = ((row[name] for name in COLUMNS) for row in rows)
-    _write(path, COLUMNS, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
+    _write_lines(path, COLUMNS, [["" if x is None or not math.isfinite(x) else x for x in line] for line in values])
 
 
 def continue_curve(
@@ -198,11 +198,11 @@ def read_peer(path: Path, required: Sequence[str] = PEER_REQUIRED) -> list[Row]:
     other names are ignored. UserError for anything else.
     """
     try:
-        header, *lines = _lines(path)
+        header, *lines = _read_lines(path)
         if missing := [name for name in required if name not in header]:
             raise ValueError(f"it has no column {missing[0]}")
-        whole = _without(SUBSET, header, lines)  # of a training's curve
-        rows = [_row(header, line, PEER_COLUMNS, required, ()) for line in whole]
+        whole = _drop_lines(SUBSET, header, lines)  # of a training's curve
+        rows = [_parse_row(header, line, PEER_COLUMNS, required, ()) for line in whole]
         if not rows:
             raise ValueError("it has no points")
         if (least := min(row["seconds"] for row in rows)) <= 0:
@@ -221,7 +221,7 @@ def write_peer(path: Path, rows: Sequence[Row]) -> None:
     """Write another program's curve with the PEER_COLUMNS that any row has."""
     columns = [name for name in PEER_COLUMNS if any(row.get(name) is not None for row in rows)]
     values = ((row.get(name) for name in columns) for row in rows)
-    _write(path, columns, [["" if x is None else f"{x:.10g}" for x in line] for line in values])
+    _write_lines(path, columns, [["" if x is None else f"{x:.10g}" for x in line] for line in values])
 
 
 def peers_of(given: Sequence[Sequence[str]], scenes: Sequence[str]) -> list[dict[str, Any]]:

@@ -86,15 +86,16 @@ def model_digest(model: Path, iteration: str) -> str | None:
 
 def image_of(file: Path) -> Image.Image:
     """Read a render or a ground truth, RGB."""
-    return _opened(file, lambda image: image.convert("RGB"))
+    return _read_image(file, lambda image: image.convert("RGB"))
 
 
 def image_size(file: Path) -> tuple[int, int]:
     """Read width and height in pixels from the file's header."""
-    return _opened(file, lambda image: image.size)
+    return _read_image(file, lambda image: image.size)
 
 
-def _opened(file: Path, read: Callable[[Image.Image], Any]) -> Any:
+def _read_image(file: Path, read: Callable[[Image.Image], Any]) -> Any:
+    """Open an image file, and return what a function reads of it. UserError for a missing or damaged file."""
     try:
         with open_image(file) as image:
             return read(image)
@@ -186,7 +187,7 @@ def sheet(
     """
     font = ImageFont.load_default(size=15)
     titles = [as_utf8(title) for title in titles]
-    cells = [[(as_utf8(label), _shrunk(image, widest)) for label, image in row] for row in rows]
+    cells = [[(as_utf8(label), _shrink(image, widest)) for label, image in row] for row in rows]
     cell_height = max(image.height for row in cells for _, image in row)
     lefts = [GAP]  # of the columns, and where one more would begin
     for title, *column in zip(titles, *cells, strict=True):
@@ -209,7 +210,7 @@ def _label_width(font: ImageFont.FreeTypeFont, label: str) -> int:
     return math.ceil(INSET + font.getlength(label) + STROKE) if label else 0
 
 
-def _shrunk(image: Image.Image, widest: int | None) -> Image.Image:
+def _shrink(image: Image.Image, widest: int | None) -> Image.Image:
     """Return the image, RGB, at no more than a width in pixels, None: as it is."""
     image = image.convert("RGB")
     if widest is None or image.width <= widest:
@@ -226,6 +227,10 @@ class ComparedViews:
     """
 
     def __init__(self, runs: Sequence[dict[str, Any]], output: Path) -> None:
+        """Read the scores of the runs, and order the views by their mean PSNR.
+
+        output: folder below which the model folders of the runs are.
+        """
         self.names = [run["config"] or "render" for run in runs]
         self._runs, self._output = runs, output
         self._per_view = [load_scores(output / run["model"], f"ours_{run['final_iteration']}")[1] for run in runs]
@@ -234,8 +239,8 @@ class ComparedViews:
         self.files = sorted(scored, key=lambda name: (statistics.fmean(own[name] for own in self._scores), name))
         self._photo_name = photo_namer(output / runs[0]["model"])
 
-    def _images(self, file: str) -> tuple[Image.Image, list[Image.Image]]:
-        pairs = [_pair(run, self._output, file) for run in self._runs]
+    def _read_images(self, file: str) -> tuple[Image.Image, list[Image.Image]]:
+        pairs = [_read_pair(run, self._output, file) for run in self._runs]
         return pairs[0][0], [render for _, render in pairs]
 
     def table(self) -> dict[str, Any]:
@@ -249,12 +254,16 @@ class ComparedViews:
             known = [key for key in SCORES if all(scores.get(key, {}).get(file) is not None for file in self.files)]
             columns = [(run, scores, key) for key in known]
         heads = [key if len(self._runs) == 1 else run["config"] for run, _, key in columns]
-        return {"heads": ["test view", *heads], "rows": [self._row(file, columns) for file in self.files]}
+        return {"heads": ["test view", *heads], "rows": [self._make_row(file, columns) for file in self.files]}
 
-    def _row(self, file: str, columns: Sequence[tuple[dict, dict, str]]) -> list[tuple[str, Path | None]]:
+    def _make_row(self, file: str, columns: Sequence[tuple[dict, dict, str]]) -> list[tuple[str, Path | None]]:
+        """Return a view's cells of the table: its name, then each score with the path of an error map, or None.
+
+        columns: run, scores of the run, and name of the score, of each column.
+        """
         cells: list[tuple[str, Path | None]] = [(self._photo_name(file), None)]
         for run, scores, key in columns:
-            path, is_psnr = error_map(_method(run, self._output), file), key == "PSNR"
+            path, is_psnr = error_map(_method_folder(run, self._output), file), key == "PSNR"
             cells.append((f"{scores[key][file]:.{2 if is_psnr else 4}f}", path if is_psnr and path.is_file() else None))
         return cells
 
@@ -264,14 +273,15 @@ class ComparedViews:
         Each has the `name` of its photo, `photo` as a JPEG, and `sets`: `text`, `render` and `error` of each run.
         """
         places = np.unique(np.linspace(0, len(self.files) - 1, min(most, len(self.files))).round().astype(int))
-        return [self._view(self.files[place]) for place in places]
+        return [self._describe_view(self.files[place]) for place in places]
 
-    def _view(self, file: str) -> dict[str, Any]:
-        photo, renders = self._images(file)
+    def _describe_view(self, file: str) -> dict[str, Any]:
+        """Return a view's name, its photo as a JPEG, and text, render and error of each run."""
+        photo, renders = self._read_images(file)
         texts = [f"{name}: {own[file]:.2f} dB" for name, own in zip(self.names, self._scores, strict=True)]
-        sets = [{"text": text, "render": _jpeg(render), "error": _jpeg(error_image(photo, render))}
+        sets = [{"text": text, "render": _to_jpeg(render), "error": _to_jpeg(error_image(photo, render))}
                 for text, render in zip(texts, renders, strict=True)]  # fmt: skip
-        return {"name": self._photo_name(file), "photo": _jpeg(photo), "sets": sets}
+        return {"name": self._photo_name(file), "photo": _to_jpeg(photo), "sets": sets}
 
     def draw_worst(self, path: Path) -> None:
         """Draw the worst views on a sheet; those of a single run with their errors. UserError if there is no view."""
@@ -279,7 +289,7 @@ class ComparedViews:
             raise UserError("no view has a PSNR of each option set")
         rows = []
         for file in self.files[:WORST]:
-            photo, renders = self._images(file)
+            photo, renders = self._read_images(file)
             labels = [f"{own[file]:.2f} dB" for own in self._scores]
             rows.append([(self._photo_name(file), photo), *zip(labels, renders, strict=True)])
             if len(renders) == 1:
@@ -289,20 +299,20 @@ class ComparedViews:
             sheet(titles, rows, WIDEST).save(temporary)
 
 
-def _method(run: dict[str, Any], output: Path) -> Path:
+def _method_folder(run: dict[str, Any], output: Path) -> Path:
     return output / run["model"] / "test" / f"ours_{run['final_iteration']}"
 
 
-def _pair(run: dict[str, Any], output: Path, name: str) -> list[Image.Image]:
+def _read_pair(run: dict[str, Any], output: Path, name: str) -> list[Image.Image]:
     """Read ground truth and render of a view, RGB, white where pixels do not count."""
-    method = _method(run, output)
+    method = _method_folder(run, output)
     pair, mask = [image_of(method / side / name) for side in ("gt", "renders")], mask_of(method, name)
     if mask is None:
         return pair
     return [Image.fromarray(np.where(mask[..., None], np.asarray(image), np.uint8(255))) for image in pair]
 
 
-def _jpeg(image: Image.Image) -> bytes:
+def _to_jpeg(image: Image.Image) -> bytes:
     buffer = io.BytesIO()
-    _shrunk(image, WIDEST).save(buffer, "JPEG", quality=_QUALITY)
+    _shrink(image, WIDEST).save(buffer, "JPEG", quality=_QUALITY)
     return buffer.getvalue()

@@ -28,6 +28,7 @@ class Stopwatch:
     """
 
     def __init__(self, counter: Callable[[], float] | None = None) -> None:
+        """Start the clock."""
         self._counter = counter or (lambda: math.nan)
         self._joules = self._counter()  # at the start, later without those of pauses
         self._joules_stopped = math.nan
@@ -48,6 +49,7 @@ class Stopwatch:
 
     @contextmanager
     def paused(self, purpose: str) -> Iterator[None]:
+        """Stop the clock inside of a `with` block, and add its seconds to `spent[purpose]`."""
         before, outer, others = running_seconds(), self._stopped, sum(self.spent.values())
         self._stopped = before if outer is None else outer
         if outer is None:
@@ -97,7 +99,7 @@ class TrainingLog:
         self.records: list[dict] = []
         self._advised = False
         if first_iteration > 0 and source.is_file():
-            self.records = [r for r in _read(source) if r["iteration"] <= first_iteration]
+            self.records = [r for r in _read_or_warn(source) if r["iteration"] <= first_iteration]
         last = self.records[-1] if self.records else {"seconds": 0.0}
         self.seconds_before = last["seconds"]
         self.wall_seconds_before = last.get("wall_seconds") or last["seconds"]
@@ -186,7 +188,7 @@ def read_log(path: str | os.PathLike) -> list[dict]:
     return records
 
 
-def _read(path: Path) -> list[dict]:
+def _read_or_warn(path: Path) -> list[dict]:
     """Read the records of a log; none, with a warning, if the file is damaged: that is no reason to stop a training."""
     try:
         return read_log(path)

@@ -75,6 +75,7 @@ class BuildModules(build_py):
     """
 
     def run(self) -> None:
+        """Copy the modules of all packages, and into each extension's package also those that all share."""
         for package in self.packages or []:
             for stale in (Path(self.build_lib) / package.replace(".", "/")).glob("*.py"):
                 stale.unlink()
@@ -102,6 +103,7 @@ class BuildBackends(build_ext):
         return str(Path(*fullname.split(".")).with_suffix(".so"))
 
     def build_extensions(self) -> None:
+        """Compile the sources of all extensions in parallel, and link one library for each."""
         # Compilers are not looked for in the current folder, for which an empty entry stands, too.
         os.environ["PATH"] = os.pathsep.join(filter(os.path.isabs, os.environ.get("PATH", "").split(os.pathsep)))
         torch, cxx = import_torch(), find_compiler()

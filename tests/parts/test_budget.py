@@ -152,7 +152,7 @@ def test_a_pace_that_quickens_before_the_last_densification_leaves_none_missing(
     control = _control(DecidedSchedule(Decided(2000, blocks, None, 9.0)), **window, max_num_splats=1000)
     # At the pace of the 80th, the 90th comes just in time.
     due = [iteration for iteration in range(1, 160) if control.actions(iteration).densify]
-    assert max(due) == 80 and control._aim(900, 80) == 1000
+    assert max(due) == 80 and control._next_count(900, 80) == 1000
 
 
 def test_a_split_leaves_other_rows_alone_and_restarts_averages():
@@ -268,7 +268,7 @@ def test_the_default_budget_follows_the_iterations_that_the_clock_allows():
     def aim(given: int, stride: float) -> int:
         """Return the number of Gaussians to have after the last densification, whatever there is before."""
         decided = Decided(30_000, [Block(15_000, 0.0, stride / 30_000, 0.0)], None, 9.0)
-        return _control(DecidedSchedule(decided), max_num_splats=given)._aim(10_000, int(14_999 / stride))
+        return _control(DecidedSchedule(decided), max_num_splats=given)._next_count(10_000, int(14_999 / stride))
 
     assert (aim(0, 10.0), aim(0, 2.0), aim(0, 1.0)) == (25 * 3000, 25 * 15_000, 400_000)
     assert (aim(123_456, 10.0), aim(20_000, 10.0)) == (25 * 3000, 20_000)  # a given number has the same bound

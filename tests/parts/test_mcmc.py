@@ -36,7 +36,7 @@ def test_every_part_has_an_effect(colmap_scene, tmp_path):
 @pytest.mark.parametrize(("growth", "count", "grown"), [(0.05, 5, 6), (0.05, 40, 42), (0.0, 5, 5), (1.0, 30, 45)])
 def test_a_few_gaussians_grow_at_least_by_one(growth, count, grown):
     control = begun("mcmc", opt=options(max_num_splats=45, mcmc_growth=growth))
-    assert control._grown(count, 600) == grown
+    assert control._next_count(count, 600) == grown
 
 
 def test_growth_ends_at_the_limit(colmap_scene, tmp_path):

@@ -11,7 +11,7 @@ from trainings import before_steps, train_on
 
 from scene.gaussians.checkpoint import load_checkpoint, save_checkpoint, with_extra_state
 from splatting.iteration import ViewOrder
-from splatting.resume_photos import NewFirst, _until, restored
+from splatting.resume_photos import NewFirst, _find_end, restore_order
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1, "--densify_until_iter", 0)
@@ -134,7 +134,7 @@ def test_the_order_takes_all_views():
     assert [NewFirst(every, 1, 9, ["x"])[t] for t in range(1, 20)] == [every[t] for t in range(1, 20)]
     for names, last, until in ((["5", "6"], 1000, 180), (["5"], 120, 110), (["5"], None, 133)):
         run = SimpleNamespace(first_iteration=100, schedule=SimpleNamespace(ends=last), views=every)
-        assert _until(run, names) == until
+        assert _find_end(run, names) == until
 
 
 @pytest.mark.parametrize(
@@ -142,4 +142,4 @@ def test_the_order_takes_all_views():
 )
 def test_damaged_records(state):
     with pytest.raises(UserError, match="record of added photos is damaged"):
-        restored(ViewOrder([SimpleNamespace(image_name="a")], 0), state)
+        restore_order(ViewOrder([SimpleNamespace(image_name="a")], 0), state)

@@ -102,7 +102,7 @@ def test_photos_count_from_their_mean_after_every_step_and_nothing_is_learnt_whi
         appearance.held = step > 3
         appearance.update_learning_rate(step)
         before = {name: values.detach().clone() for name, values in appearance.numbers.items()}
-        (appearance.shown(torch.rand(3, 4, 5), NAMES[step % 3]).sum() + appearance.pull("a.png")).backward()
+        (appearance.shown(torch.rand(3, 4, 5), NAMES[step % 3]).sum() + appearance.size_penalty("a.png")).backward()
         appearance.step()
         for name, values in appearance.numbers.items():
             assert torch.equal(values, before[name]) == (step > 3), (step, name)
@@ -122,16 +122,16 @@ def test_a_fit_finds_the_least_squares():
     appearance, generator = _random(size=0.3), torch.Generator().manual_seed(1)
     image, row = torch.rand(3, 12, 16, generator=generator), appearance.camera_of(4)
     gains = torch.tensor([0.9, -0.4, 0.2])[:, None, None]
-    target = (appearance._seen(image, gains, row) + 0.05 * torch.randn(3, 12, 16, generator=generator)).clamp(0, 1)
+    target = (appearance._show(image, gains, row) + 0.05 * torch.randn(3, 12, 16, generator=generator)).clamp(0, 1)
     counts = torch.arange(16).expand(1, 12, 16) < 8
     fitted = appearance.fitted(image, torch.where(counts, target, 0.0), counts, 4)
 
     def error(gains: np.ndarray) -> float:
-        seen = appearance._seen(image, torch.tensor(gains, dtype=torch.float32)[:, None, None], row).clamp(0, 1)
+        seen = appearance._show(image, torch.tensor(gains, dtype=torch.float32)[:, None, None], row).clamp(0, 1)
         return (seen - target)[:, :, :8].double().square().mean().item()
 
     found = minimize(error, np.zeros(3), method="Nelder-Mead", options={"xatol": 1e-5, "fatol": 1e-12})
-    least = appearance._seen(image, torch.tensor(found.x, dtype=torch.float32)[:, None, None], row).clamp(0, 1)
+    least = appearance._show(image, torch.tensor(found.x, dtype=torch.float32)[:, None, None], row).clamp(0, 1)
     torch.testing.assert_close(fitted, least, rtol=0, atol=2e-3)
     assert torch.equal(PhotoAppearance().fitted(image, image, counts, 4), image)  # nothing has trained
 

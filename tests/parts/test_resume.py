@@ -13,7 +13,7 @@ from groundwork.files.json_files import read_model_json
 from scene.gaussians.checkpoint import load_checkpoint
 from splatting import resume
 from splatting.folder import REPLACED, new_folder
-from splatting.resume import finished
+from splatting.resume import read_end
 from utils.system_utils import UserError
 
 WORDS = ("-r", 24, "--no_curve", "--disable_viewer", "--test_iterations", -1)
@@ -61,9 +61,9 @@ def test_resumed_to_the_same_bytes_by_the_same_command(colmap_scene, tmp_path, m
             _train(colmap_scene, out, 40, "--resume")
         assert _checkpoints(out) == ({REPLACED} if newest else set())
         assert newest is None or load_checkpoint(out / REPLACED)[1] == newest
-        assert finished(out) is None
+        assert read_end(out) is None
     assert _train(colmap_scene, out, 40, "--resume") == whole
-    assert _checkpoints(out) == {"chkpnt40.pth"} and finished(out).iteration == 40
+    assert _checkpoints(out) == {"chkpnt40.pth"} and read_end(out).iteration == 40
     said = rf"^Last checkpoint: {out}/chkpnt40.pth \(1.\d+ MB\); --resume with more --iterations cont"
     assert re.search(said, capfd.readouterr().out, re.MULTILINE)
     before = (out / "cfg_args").stat().st_mtime_ns
@@ -79,16 +79,16 @@ def test_a_model_alone_is_no_end(colmap_scene, tmp_path, monkeypatch):
     with monkeypatch.context() as patch, pytest.raises(Killed):
         _killed(patch, 12)
         _train(colmap_scene, tmp_path, 12, "--resume")
-    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and finished(tmp_path) is None
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and read_end(tmp_path) is None
     _train(colmap_scene, tmp_path, 12, "--resume")
-    assert finished(tmp_path).iteration == 12
+    assert read_end(tmp_path).iteration == 12
 
 
 def test_more_iterations_continue_a_finished_training(colmap_scene, tmp_path, capfd):
     _train(colmap_scene, tmp_path, 12)
     _train(colmap_scene, tmp_path, 20, "--resume")
     assert f"Resuming {tmp_path} at iteration 12" in (said := capfd.readouterr()).out
-    assert _checkpoints(tmp_path) == {"chkpnt12.pth", "chkpnt20.pth"} and finished(tmp_path).iteration == 20
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth", "chkpnt20.pth"} and read_end(tmp_path).iteration == 20
     assert "starts over" not in said.err
     (tmp_path / REPLACED).write_bytes(b"of another training")
     _train(colmap_scene, tmp_path, 20)
@@ -124,7 +124,7 @@ def test_a_model_of_which_nobody_knows_that_it_is_unfinished_is_not_replaced(col
 def test_a_training_of_another_length_leaves_a_checkpoint_that_seconds_continue(colmap_scene, tmp_path, capfd):
     words = *WORDS, "--iterations", 20
     train_on(colmap_scene, tmp_path, *words, "--schedule", 12)
-    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and finished(tmp_path).iteration == 12
+    assert _checkpoints(tmp_path) == {"chkpnt12.pth"} and read_end(tmp_path).iteration == 12
     train_on(colmap_scene, tmp_path, *words, "--schedule", 12, "--resume")
     assert "of 12 iterations; --time_budget SECONDS continues it" in capfd.readouterr().out
     with pytest.raises(UserError, match="of 12 iterations; give --resume with --time_budget SECONDS to continue it"):
@@ -146,7 +146,7 @@ def test_a_full_disk_ends_no_training(colmap_scene, tmp_path, capfd):
     (tmp_path / "chkpnt12.pth").mkdir()  # which cannot be replaced by a file
     _train(colmap_scene, tmp_path, 12)
     assert f"warning: cannot write {tmp_path / 'chkpnt12.pth'}" in capfd.readouterr().err
-    assert finished(tmp_path).iteration == 12
+    assert read_end(tmp_path).iteration == 12
 
 
 def test_new_folders_are_named_after_the_scene(tmp_path, monkeypatch):

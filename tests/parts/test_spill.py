@@ -64,7 +64,7 @@ def _memory(monkeypatch: pytest.MonkeyPatch, limit: float, photos: int = 0) -> G
     monkeypatch.setattr(torch.cuda, "memory_reserved", lambda device: 0)
     monkeypatch.setattr(torch.cuda, "mem_get_info", lambda device: (2**31, 2**32))
     memory = GpuMemory(limit, model(50), False, torch.device("cuda"))
-    memory.reserve(50, SCENE)
+    memory.limit_for(50, SCENE)
     return memory
 
 
@@ -93,18 +93,18 @@ def test_the_share_follows_the_number_of_gaussians(monkeypatch):
 @needs_59_values
 def test_a_limit_begins_where_the_gpu_has_too_little(monkeypatch):
     memory = _memory(monkeypatch, 0)
-    memory.reserve(500_000, SCENE)
+    memory.limit_for(500_000, SCENE)
     assert memory.limit == 0 == memory.host_bytes(500_000)
     assert memory.remedy(1000, 540_000) == "set --gpu_memory, or " and memory.remedy(1000, 540_001) == ""
-    memory.reserve(1_300_000, SCENE)
+    memory.limit_for(1_300_000, SCENE)
     assert memory.limit == int(spill._USABLE * 2**30)
     said = sentences(memory, 1_300_000, 0.02, True)
     assert len(said) == 1 and "GiB of 1,300,000 Gaussians are kept in the host's memory" in said[0]
     assert said[0].endswith("the saved files are the same")
-    memory.reserve(10**9, SCENE)  # no other limit
+    memory.limit_for(10**9, SCENE)  # no other limit
     assert memory.limit == int(spill._USABLE * 2**30) and memory.remedy(1000, 1) == ""
     there = GpuMemory(0.0, model(50), False, torch.device("cpu"))
-    there.reserve(10**12, SCENE)
+    there.limit_for(10**12, SCENE)
     assert there.limit == 0 and there.remedy(1000, 1) == ""
 
 

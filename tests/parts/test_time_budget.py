@@ -23,7 +23,7 @@ from splatting.log import ProgressBar
 from splatting.records.training_log import Stopwatch
 from splatting.registry import strategies, strategy_part
 from splatting.run import Run
-from splatting.schedule import Schedule, longer_steps
+from splatting.schedule import Schedule, stride_rate_factor
 from utils.system_utils import UserError
 
 OPTIONS = ["-r", 24, "--eval", "--no_curve", "--test_iterations", -1, "--densify_grad_threshold", 1e-4,
@@ -591,7 +591,7 @@ def test_rates_fall_to_a_tenth_at_the_end(length, steps, factor):
     falling = factors[held:]
     assert falling == sorted(falling, reverse=True) and falling[0] > 0.98 * factor
     assert schedule.rate_factor(int(0.85 * steps)) == pytest.approx(0.55 * factor, abs=0.01 * factor)
-    assert factors == pytest.approx([longer_steps(30_000 / steps, iteration / steps) for iteration in percents])
+    assert factors == pytest.approx([stride_rate_factor(30_000 / steps, iteration / steps) for iteration in percents])
 
 
 @pytest.mark.parametrize(

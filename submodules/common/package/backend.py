@@ -22,7 +22,7 @@ except ModuleNotFoundError as error:
 _TYPES = {"TypeError": TypeError, "ValueError": ValueError, "OutOfMemoryError": torch.OutOfMemoryError}
 
 
-def _operators() -> SimpleNamespace:
+def _load_operators() -> SimpleNamespace:
     """Return a function for each operator; its attribute `default` is the operator."""
     library = Path(__file__).with_name("_backend.so")
     try:
@@ -31,10 +31,15 @@ def _operators() -> SimpleNamespace:
         what = f"does not fit torch {torch.__version__}" if library.exists() else "is not built"
         raise ImportError(f"{_PACKAGE} {what}: {_BUILD}") from error
     names = [name.split("::") for name in torch._C._dispatch_get_all_op_names() if name.startswith(f"{_PACKAGE}::")]
-    return SimpleNamespace(**{name: _raising(getattr(getattr(torch.ops, _PACKAGE), name)) for _, name in names})
+    return SimpleNamespace(**{name: _retype_errors(getattr(getattr(torch.ops, _PACKAGE), name)) for _, name in names})
 
 
-def _raising(packet: Any) -> Callable[..., Any]:
+def _retype_errors(packet: Any) -> Callable[..., Any]:
+    """Return a function that calls an operator and raises the error that its message names.
+
+    packet: operator, as torch.ops has it.
+    """
+
     def call(*arguments: Any, **named: Any) -> Any:
         try:
             return packet(*arguments, **named)
@@ -54,4 +59,4 @@ def has_kernels(operator: str, device: str) -> bool:
     return torch._C._dispatch_has_kernel_for_dispatch_key(f"{_PACKAGE}::{operator}", device.upper())
 
 
-OPERATORS = _operators()
+OPERATORS = _load_operators()

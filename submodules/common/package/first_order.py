@@ -95,6 +95,8 @@ def first_order(name: str) -> Callable[[Callable[..., tuple]], Callable[..., tup
     """
 
     def decorate(backward: Callable[..., tuple]) -> Callable[..., tuple]:
+        """Return a backward whose results refuse to be differentiated."""
+
         @functools.wraps(backward)
         def wrapper(ctx: Any, *gradients: Tensor | None) -> tuple:
             if not torch.is_grad_enabled():

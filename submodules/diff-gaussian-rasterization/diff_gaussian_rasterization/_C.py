@@ -62,9 +62,9 @@ def rasterize_gaussians(
     options = image_height, image_width, degree, not of_2023 and antialiasing, False
     out = draw(Scene(*gaussians, *camera_arguments(*place, lens, *options)), background, True)
     buffers = (
-        _packed(out.splat_slots, out.splats, out.tile_counts),
-        _packed(out.instances),
-        _packed(out.ranges, out.transmittance, out.last),
+        _pack(out.splat_slots, out.splats, out.tile_counts),
+        _pack(out.instances),
+        _pack(out.ranges, out.transmittance, out.last),
     )
     rendered = len(out.instances), out.color, out.radii, *buffers
     return rendered if of_2023 else (*rendered, out.inverse_depth)
@@ -106,11 +106,11 @@ def rasterize_gaussians_backward(
     count, (height, width) = len(means3D), grad_out_color.shape[1:]
     floats, ints, longs = means3D.dtype, torch.int32, torch.int64
     geometry = (longs, (count + 1, 2)), (floats, (count, SPLAT_VALUES)), (ints, (count,))
-    splat_slots, splats, tile_counts = _unpacked(geomBuffer, geometry)
-    (instances,) = _unpacked(binningBuffer, [(ints, (num_rendered,))])
+    splat_slots, splats, tile_counts = _unpack(geomBuffer, geometry)
+    (instances,) = _unpack(binningBuffer, [(ints, (num_rendered,))])
     tiles = -(-height // TILE) * -(-width // TILE)
     image = (longs, (tiles + 1,)), (floats, (1, height, width)), (ints, (height, width))
-    ranges, transmittance, last = _unpacked(imgBuffer, image)
+    ranges, transmittance, last = _unpack(imgBuffer, image)
     slots = instances.new_empty(int(splat_slots[-1, 0]), 0)
 
     place, lens = (viewmatrix, projmatrix, campos), (tan_fovx, tan_fovy, scale_modifier)
@@ -149,13 +149,13 @@ def adamUpdate(
     sparse_adam_(param, grad, exp_avg, exp_avg_sq, visibility, lr, b1, b2, eps)
 
 
-def _packed(*tensors: Tensor) -> Tensor:
+def _pack(*tensors: Tensor) -> Tensor:
     """Copies tensors of several types into one of bytes, (B,) uint8, as the reference hands a state around."""
     return torch.cat([values.contiguous().reshape(-1).view(torch.uint8) for values in tensors])
 
 
-def _unpacked(buffer: Tensor, parts: Iterable[tuple[torch.dtype, tuple[int, ...]]]) -> list[Tensor]:
-    """Copies the tensors of `_packed` out again, given their dtypes and shapes.
+def _unpack(buffer: Tensor, parts: Iterable[tuple[torch.dtype, tuple[int, ...]]]) -> list[Tensor]:
+    """Copies the tensors of `_pack` out again, given their dtypes and shapes.
 
     Raises ValueError if the buffer has another size.
     """

@@ -27,7 +27,7 @@ def split_positions(
     item and draw, each of the last four below 2^32. Every device and number of threads gives the same bits.
     """
     children = means.clone(memory_format=torch.contiguous_format)
-    _displace(children, log_scales, rotations, None, items, [], _signed(seed), stream, iteration, draw)
+    _displace(children, log_scales, rotations, None, items, [], _to_signed(seed), stream, iteration, draw)
     return children
 
 
@@ -56,7 +56,7 @@ def add_noise_(
     same bits. stopped: of a guard (optim.py); once it is not 0, nothing changes.
     """
     gate = [size, steepness, threshold]
-    _displace(means, log_scales, rotations, logits, None, gate, _signed(seed), stream, iteration, 0, stopped, first)
+    _displace(means, log_scales, rotations, logits, None, gate, _to_signed(seed), stream, iteration, 0, stopped, first)
 
 
 def penalise_(
@@ -82,9 +82,9 @@ def random_words(items: Tensor, *, seed: int, stream: int, iteration: int, draw:
     Philox-4x32-10 (Salmon et al. 2011) of item, draw, iteration and stream, each below 2^32, by the seed's lower 64
     bits. Every device and number of threads gives the same bits.
     """
-    return OPERATORS.random_words(items, _signed(seed), stream, iteration, draw)
+    return OPERATORS.random_words(items, _to_signed(seed), stream, iteration, draw)
 
 
-def _signed(seed: int) -> int:
+def _to_signed(seed: int) -> int:
     """Return the lower 64 bits of a seed as the operators take them."""
     return (seed + 2**63) % 2**64 - 2**63

@@ -27,7 +27,13 @@ def fake(name: str) -> Callable:
     return library.register_fake(f"diff_gaussian_rasterization::{name}")
 
 
-def _binned(like: Tensor, count: int, height: int, width: int, train: bool) -> tuple[Tensor, ...]:
+def _make_lists(like: Tensor, count: int, height: int, width: int, train: bool) -> tuple[Tensor, ...]:
+    """Return empty lists as the operator `bin` returns them: instances, ranges, splat_slots and slots.
+
+    like: tensor that gives the device.
+    count: number of Gaussians.
+    train: true if a backward follows, which needs slots.
+    """
     instances = library.get_ctx().new_dynamic_size()
     slots = library.get_ctx().new_dynamic_size() if train else 0
     tiles = -(-height // TILE) * -(-width // TILE)
@@ -39,7 +45,13 @@ def _binned(like: Tensor, count: int, height: int, width: int, train: bool) -> t
     )
 
 
-def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: bool) -> tuple[Tensor, ...]:
+def _make_planes(like: Tensor, height: int, width: int, inverse_depth: bool, train: bool) -> tuple[Tensor, ...]:
+    """Return empty planes as the operator `blend` returns them: color, transmittance, inverse_depth, last and layers.
+
+    like: tensor that gives dtype and device.
+    inverse_depth: true if it is wanted.
+    train: true if a backward follows, which needs last and layers.
+    """
     return (
         like.new_empty((3, height, width)),
         like.new_empty((1, height, width)),
@@ -49,7 +61,7 @@ def _blended(like: Tensor, height: int, width: int, inverse_depth: bool, train: 
     )
 
 
-def _splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) -> Tensor:
+def _make_splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) -> Tensor:
     rays = any(options[5:])
     values = SPLAT_VALUES + RAY_VALUES * rays + LENS_RAY_VALUES * (rays and len(lens) > 5)
     return means.new_empty((means.shape[0], values))
@@ -59,29 +71,30 @@ def _splats(means: Tensor, lens: tuple[float, ...], options: tuple[int, ...]) ->
 def _(means, *arguments):
     count = means.shape[0]
     ints = [means.new_empty(shape, dtype=torch.int32) for shape in ((count, 4), (count,), (count,))]
-    return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints
+    return _make_splats(means, *arguments[10:12]), means.new_empty((count,)), *ints
 
 
 @fake("project_binned")
 def _(means, *arguments):
     count, (height, width, *_), train = means.shape[0], arguments[11], arguments[12]
     ints = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
-    lists = _binned(means, count, height, width, train)
-    return _splats(means, *arguments[10:12]), means.new_empty((count,)), *ints, *lists
+    lists = _make_lists(means, count, height, width, train)
+    return _make_splats(means, *arguments[10:12]), means.new_empty((count,)), *ints, *lists
 
 
 @fake("bin")
 def _(splats, depths, rects, tile_counts, height, width, train):
-    return _binned(splats, splats.shape[0], height, width, train)
+    return _make_lists(splats, splats.shape[0], height, width, train)
 
 
 @fake("blend")
 def _(splats, instances, ranges, background, height, width, inverse_depth, train):
-    return _blended(splats, height, width, inverse_depth, train)
+    return _make_planes(splats, height, width, inverse_depth, train)
 
 
 @fake("blend_rows")
 def _(source, *arguments):
+    """Return empty gradient rows (R, values), for any R, and their counts (N,) int32."""
     absolute = len(arguments) == 4 and arguments[-1]  # the dispatcher leaves a default out
     splats = source[0]
     values = splats.shape[1] - SPLAT_VALUES + MOMENT_VALUES + absolute * ABSOLUTE_VALUES
@@ -98,6 +111,7 @@ def _(splats, channels, instances, ranges, background, height, width, cap, chann
 
 @fake("channel_moments")
 def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wanted, channels_last=False):
+    """Return empty moments, lengths of absolute gradients (N,), and gradients of channels (N, C)."""
     splats = source[0]
     count = splats.shape[0]
     lengths = splats.new_empty((count if absolute else 0,))
@@ -106,6 +120,7 @@ def _(source, channels, grad_color, grad_transmittance, cap, stops, absolute, wa
 
 @fake("rasterize_vjp")
 def _(means, opacities, *arguments):
+    """Return empty gradients, one for each of GRADIENTS; those that are not wanted have no rows."""
     sh_rest, wanted = arguments[5], arguments[11]
     rows = _ROWS | {"sh_rest": (0 if sh_rest is None else sh_rest.shape[1], 3)}
     rows["opacities"] = opacities.shape[1:] if wanted[2] else (1,)
@@ -127,12 +142,13 @@ def _(sums):
 
 @fake("rasterize")
 def _(means2d, means, *arguments):
+    """Return empty planes, radii, splats, tile_counts and lists, in the order of `Drawing`."""
     options, _, inverse_depth, train = arguments[11:15]  # what follows is left out where it has its default
     count, (height, width, *_) = means.shape[0], options
-    color, transmittance, depth, last, layers = _blended(means, height, width, inverse_depth, train)
+    color, transmittance, depth, last, layers = _make_planes(means, height, width, inverse_depth, train)
     radii, tile_counts = (means.new_empty((count,), dtype=torch.int32) for _ in range(2))
-    projected = radii, _splats(means, arguments[10], options), tile_counts
-    lists = _binned(means, count, height, width, train)
+    projected = radii, _make_splats(means, arguments[10], options), tile_counts
+    lists = _make_lists(means, count, height, width, train)
     return color, transmittance, depth, *projected, *lists, last, layers
 
 
@@ -143,6 +159,7 @@ def _(splats, *_):
 
 @fake("list_records")
 def _(rects, tile_counts, limits, counts=None, splats=None, depths=None, room=0):
+    """Return empty counts of records by block; given the counts, empty lists with `room` records in their place."""
     if counts is None:
         counts = rects.new_empty((limits.shape[1] + 1, -(-rects.shape[0] // RECORD_BLOCK)))
         return counts, *(rects.new_empty((0,)) for _ in range(6))

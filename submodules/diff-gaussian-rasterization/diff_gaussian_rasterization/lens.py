@@ -66,7 +66,7 @@ class Lens(NamedTuple):
         more = self.values
         if not all(map(math.isfinite, more)) or min(self.focal) <= 0:
             raise ValueError(f"a lens needs finite numbers and focal lengths above 0, got {more}")
-        field, turn, reach, *sleep = self._bounds(width, height)
+        field, turn, reach, *sleep = self._find_bounds(width, height)
         limit = turn if self.chart == "perspective" else field
         return float(_CHARTS.index(self.chart)), limit * limit, reach, field, *sleep, *more
 
@@ -76,10 +76,10 @@ class Lens(NamedTuple):
         It ends where the distortion turns back, and a little outside of the image's corners. A fisheye shows no
         Gaussian beyond it, a perspective lens all up to where its distortion turns back.
         """
-        return self._bounds(width, height)[0]
+        return self._find_bounds(width, height)[0]
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019  (a lens is a value)
-    def _bounds(self, width: int, height: int) -> tuple[float, ...]:
+    def _find_bounds(self, width: int, height: int) -> tuple[float, ...]:
         """The field, where the distortion turns back, and how many times it widens the view, at least 1.
 
         Then, for blocks that sleep, the steepest slope of pixels by the chart's numbers, or by a direction, and how far

@@ -153,6 +153,7 @@ def _keep(ctx, inputs, output):
 
 @first_order("rasterize")
 def _backward(ctx, grad_color, grad_transmittance, grad_inverse_depth, *_):
+    """Return the gradients of the operator's inputs, None for those that are not needed."""
     if not ctx.train:
         raise RuntimeError("this image was rasterized with train=False, so it has no backward")
     saved, needed = ctx.saved_tensors, list(ctx.needs_input_grad)
@@ -206,6 +207,7 @@ class _Rasterize(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, *inputs):
+        """Rasterize, keep what the backward needs, and return color, transmittance, inverse depth and radii."""
         with torch._C._AutoDispatchBelowAutograd():
             output = OPERATORS.rasterize(*inputs)
         _keep(ctx, inputs, output)

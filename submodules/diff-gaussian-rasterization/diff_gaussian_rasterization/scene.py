@@ -96,7 +96,7 @@ def scene_arguments(gaussians: Gaussians, settings: GaussianRasterizationSetting
     if settings.lens is not None:
         if not isinstance(settings.lens, Lens):
             raise ValueError(f"lens must be a Lens or None, got {settings.lens!r}")
-        shown = settings.lens if settings.lens_values is None else _with_values(settings.lens, settings.lens_values)
+        shown = settings.lens if settings.lens_values is None else _replace_values(settings.lens, settings.lens_values)
         lens += shown.numbers(*size[::-1])
         if settings.projection == "ray":
             check_rays(shown)
@@ -116,7 +116,7 @@ def check_rays(lens: Lens) -> None:
         raise ValueError(f"projection='ray' needs tiles of 16 pixels to span under 150 degrees, got focal {lens.focal}")
 
 
-def _with_values(lens: Lens, values: Tensor) -> Lens:
+def _replace_values(lens: Lens, values: Tensor) -> Lens:
     if not isinstance(values, Tensor) or values.shape != (LENS_VALUES,) or not values.is_floating_point():
         raise ValueError(f"lens_values must be a tensor of {LENS_VALUES} floats, those of Lens.values")
     return lens.with_values(values.tolist())

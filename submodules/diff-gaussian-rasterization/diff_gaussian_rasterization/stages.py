@@ -37,6 +37,7 @@ class Shared:
     __slots__ = ("describe_moments", "hooks", "lengths", "moments", "sent", "shown", "task", "use_lengths")
 
     def __init__(self) -> None:
+        """Begin without a message."""
         self.lengths: Tensor | None = None  # of absolute gradients, (N,)
         self.shown: Tensor | None = None  # (N,) int32: not 0 of rows that get gradients beside those of the image
         self.use_lengths: Callable[[Tensor], None] | None = None
@@ -69,6 +70,7 @@ class _Projected(Function):
     def forward(
         ctx: Any, shared: Shared, train: bool | None, camera: Tensor | None, means2d: Tensor | None, *scene: Any
     ) -> tuple:
+        """Project the Gaussians, and make lists of the splats of each tile, unless `train` is None."""
         with torch._C._AutoDispatchBelowAutograd():
             if train is None:
                 splats, depths, rects, *counts = OPERATORS.project(*scene)
@@ -84,6 +86,11 @@ class _Projected(Function):
     @staticmethod
     @first_order("rasterize_channels")
     def backward(ctx: Any, moments: Tensor | None, of_depth: Tensor | None, *_: Any) -> tuple:
+        """Return the gradients of camera, means2d and Gaussians, made of moments and gradients of depths.
+
+        moments: (N, values), of the splats; None: zeros.
+        of_depth: gradient of the depths (N,), or None.
+        """
         needed, saved = ctx.needs_input_grad, ctx.saved_tensors
         results, scene = [None] * len(needed), (*saved[:_TENSORS], *ctx.numbers)
         splats, tile_counts = saved[_TENSORS:]
@@ -128,6 +135,7 @@ class _Blended(Function):
         tile_counts: Tensor, rows: Tensor | None, splats: Tensor, means2d: Tensor | None, conics: Tensor | None,
         opacities: Tensor | None, depths: Tensor | None, features: Tensor | None, background: Tensor,
     ) -> tuple[Tensor, ...]:  # fmt: skip
+        """Blend the channels of the splats, and keep what the backward needs."""
         with torch._C._AutoDispatchBelowAutograd():
             if len(lists) == 1:
                 lists = OPERATORS.bin(splats, order, *lists, tile_counts, *how.size, train)
@@ -150,6 +158,10 @@ class _Blended(Function):
     @staticmethod
     @first_order("rasterize_channels")
     def backward(ctx: Any, of_image: Tensor | None, of_alpha: Tensor | None, *_: Any) -> tuple:
+        """Return the moments or, if splats are described, the gradients of their description; and those of features.
+
+        of_image, of_alpha: gradients of the two results, in their shapes; None: zeros.
+        """
         (rows, values, *kept), how, needed = ctx.saved_tensors, ctx.how, ctx.needs_input_grad
         splats, tile_counts, transmittance, shared = kept[0], kept[1], kept[9], ctx.shared
         last = how.channels_last
@@ -175,7 +187,7 @@ class _Blended(Function):
             results[7] = moments
         first, count = ctx.widths
         if needed[11]:
-            results[11] = _packed(of_values[:, -1], rows)
+            results[11] = _select_rows(of_values[:, -1], rows)
         if needed[12]:
             results[12] = of_values if of_values.shape[1] == count else of_values[:, first : first + count]
         if needed[13]:
@@ -184,7 +196,7 @@ class _Blended(Function):
         return tuple(results)
 
 
-def _packed(values: Tensor, rows: Tensor | None) -> Tensor:
+def _select_rows(values: Tensor, rows: Tensor | None) -> Tensor:
     return values[None] if rows is None else values[rows]
 
 

@@ -22,22 +22,29 @@ def photometric_loss_by_bands(
     add: Callable[[Tensor], Tensor],
     clamp: bool = True,
 ) -> tuple[Tensor, Tensor]:
-    """`fused_photometric_loss` of the whole image, and its gradient in rows [first, end): the same bits as there.
+    """Return `fused_photometric_loss` of the whole image, bit for bit, and its gradient in rows [first, end).
 
-    img1, img2: (..., H, W), of which only these rows and REACH more on either side count. add: sums a tensor of float64
-    over all processes, whose bands make up the image; each number is 0 on all but one. clamp: as there. Other rows of
-    the gradient have any values.
-    Raises what `fused_photometric_loss` raises, and ValueError for rows that are no band.
+    Other rows of the gradient have any values. Raises what `fused_photometric_loss` raises, and ValueError for rows
+    that are no band.
+
+    img1, img2: (..., H, W), of which only these rows and REACH more on either side count.
+    lambda_dssim: weight of 1 - SSIM.
+    rows: first row of this process's band, and the end.
+    add: sums a tensor of float64 over all processes, whose bands make up the image; each number is 0 on all but one.
+    clamp: true to clamp img1 to [0, 1] first.
     """
     check_images(img1, img2, "same")
     return _Banded.apply(img1, img2.detach(), float(lambda_dssim), rows, add, clamp)
 
 
 class _Banded(torch.autograd.Function):
+    """The loss of all bands, whose gradient is that of this process's rows."""
+
     @staticmethod
     def forward(
         ctx: Any, img1: Tensor, img2: Tensor, lambda_dssim: float, rows: tuple[int, int], add: Callable, clamp: bool
     ):
+        """Return the loss and L1, scalars, of the sums over all bands."""
         sums, kept = OPERATORS.photometric_band(img1, img2, *rows, clamp)
         loss, l1 = OPERATORS.photometric_of_sums(img1, add(sums), lambda_dssim)
         ctx.mark_non_differentiable(l1)

@@ -101,6 +101,7 @@ struct Visible {
   }
 };
 
+// Writes the tiles that a splat reaches, found once more from its values, as no mask was kept.
 template <class T, int kRays>
 void list_again(const Projected<T>& in, int32_t i, TileRect rect, Image image, int32_t* tiles) {
   SplatOf<T, kRays> splat;

@@ -397,6 +397,7 @@ void keep_rows(const Executor& executor, const BlendInput<T>& in, const BlendGra
   });
 }
 
+// Sums the gradient rows that the caller has, which lie splat after splat.
 template <class T, int kRays, bool kAbsolute>
 void sum_given(const Executor& executor, const SplatRows<T>& in, const RowSums<T>& to) {
   std::vector<const T*> begin(in.count + 1, in.rows);

@@ -11,6 +11,7 @@ void displace(const Executor& executor, const Displacement& in) {
   for_each_row(executor, in.count, 1024, [&](int64_t i) { displace(in, i); });
 }
 
+// Computes exp or log of every value, rounded alike on every machine.
 void elementary(const Executor& executor, const Elementary& in) {
   for_each_row(executor, in.count, 4096, [&](int64_t i) { elementary(in, i); });
 }

@@ -27,6 +27,7 @@ Projected<T> part_of(const Projected<T>& out, int64_t first) {
           out.table};
 }
 
+// Marks all Gaussians of a part as not shown.
 template <class T>
 void cull_all(int64_t count, const Projected<T>& out) {
   std::fill_n(out.depths, count, T(INFINITY));

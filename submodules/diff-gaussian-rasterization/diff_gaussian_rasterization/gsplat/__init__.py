@@ -22,7 +22,7 @@ from diff_gaussian_rasterization.backend import OPERATORS
 from diff_gaussian_rasterization.channels import MOST_CHANNELS
 from diff_gaussian_rasterization.first_order import needs_function
 from diff_gaussian_rasterization.gsplat.description import described
-from diff_gaussian_rasterization.gsplat.inputs import Call, Item, checked, items_of
+from diff_gaussian_rasterization.gsplat.inputs import Call, Item, check_call, split_images
 from diff_gaussian_rasterization.gsplat.meta import Meta
 from diff_gaussian_rasterization.harmonics import sh_values
 from diff_gaussian_rasterization.lens import Lens
@@ -128,17 +128,23 @@ def rasterization(
     meta["means2d"].absgrad, of at most 32 channels; x has the length of x and y in NDC, times 2 / width, and y is 0.
     Returns images (..., C, H, W, D), alphas (..., C, H, W, 1), and meta. ValueError: what cannot be drawn.
     """
-    call, backgrounds, tile = checked(locals())
+    call, backgrounds, tile = check_call(locals())
     given = Item(means, quats, scales, covars, opacities, colors, extra_signals, viewmats, Ks, backgrounds)
     with _without_autocast(means.device.type):  # whose products of matrices are of 8 or 11 bits
-        return _rendered(call, given, tile, sparse_grad)
+        return _render_all(call, given, tile, sparse_grad)
 
 
 def _without_autocast(device: str) -> contextlib.AbstractContextManager:
     return torch.autocast(device, enabled=False) if torch.is_autocast_enabled(device) else _NO_CONTEXT
 
 
-def _rendered(call: Call, given: Item, tile: int, sparse: bool) -> tuple[Tensor, Tensor, Meta]:
+def _render_all(call: Call, given: Item, tile: int, sparse: bool) -> tuple[Tensor, Tensor, Meta]:
+    """Render all images of a call. Return images, alphas and meta, as `rasterization` does.
+
+    given: tensors of all images.
+    tile: side of the tiles that meta tells of, px.
+    sparse: true if gradients of means, quats and scales are sparse.
+    """
     shown: list[Tensor] = []
     if sparse:
         if not call.packed or given.means.dim() != 2:
@@ -146,33 +152,34 @@ def _rendered(call: Call, given: Item, tile: int, sparse: bool) -> tuple[Tensor,
         rows = {name: getattr(given, name) for name in ("means", "quats", "scales")}
         given = given._replace(**{name: None if t is None else _Sparse.apply(t, shown) for name, t in rows.items()})
     form = *given.means.shape[:-2], given.view.shape[-3] if given.view.dim() > 2 else 1
-    items = items_of(call, given, form)
+    items = split_images(call, given, form)
     projections = [_project(call, item) for item in items]
-    notes, pieces = _joined(call, [one.notes for one in projections], form)
+    notes, pieces = _join_notes(call, [one.notes for one in projections], form)
     drawn = [_blend(call, *one) for one in zip(items, projections, pieces, strict=True)]
     lists = [(*one[3], projection.order) for one, projection in zip(drawn, projections, strict=True)]
-    meta = _meta(call, notes, lists, projections, form, tile)
+    meta = _make_meta(call, notes, lists, projections, form, tile)
     if given.signals is not None:
-        meta["render_extra_signals"] = _together([one[2] for one in drawn], form)
+        meta["render_extra_signals"] = _stack_images([one[2] for one in drawn], form)
     shown += [meta["gaussian_ids"]] * sparse
-    image, alpha = (_together([one[at] for one in drawn], form) for at in (0, 1))
+    image, alpha = (_stack_images([one[at] for one in drawn], form) for at in (0, 1))
     return image, alpha, meta
 
 
-def _together(parts: Sequence[Tensor], form: tuple[int, ...]) -> Tensor:
+def _stack_images(parts: Sequence[Tensor], form: tuple[int, ...]) -> Tensor:
     """Tensors (1, ...) of all images as one."""
     whole = parts[0] if len(parts) == 1 else torch.cat(tuple(parts))
     return whole if len(form) == 1 else whole.unflatten(0, form)
 
 
 def _project(call: Call, item: Item) -> _Projection:
+    """Project the Gaussians of one image, and describe them as programs of gsplat know them."""
     view, near = item.view, call.near
     camera = OPERATORS.pinhole(view.detach(), item.K, *call.size)
     if call.model == "ortho":  # a pinhole for which all is at the same depth, up to rounding, but for its centre
         view, near = torch.cat([view[:2], _FLAT * view[2:3] + view.new_tensor([[0, 0, 0, 1]]), view[3:]]), 0.0
         camera = *OPERATORS.pinhole(view.detach(), item.K, *call.size)[:2], camera[2]
-    lens = _lens(call, item.K)
-    opacities, depth = item.opacities, _depth(call, item)
+    lens = _lens_numbers(call, item.K)
+    opacities, depth = item.opacities, _find_depths(call, item)
     if call.model != "pinhole" or call.far < _ENDLESS:  # the kernels know the near plane of a pinhole alone
         z = item.means.detach() @ item.view.detach()[2, :3] + item.view.detach()[2, 3]
         opacities = torch.where((z > call.near) & (z < call.far), opacities, 0)
@@ -181,15 +188,15 @@ def _project(call: Call, item: Item) -> _Projection:
         bands = colors if colors.shape[1] <= MOST_BANDS else colors[:, :MOST_BANDS]
         degree, harmonics = call.degree, bands.split((1, bands.shape[1] - 1), 1)
     elif colors is not None:
-        features.append(_shown(item, colors, call.degree, 0.0))
+        features.append(_evaluate_features(item, colors, call.degree, 0.0))
     if item.signals is not None:
-        features.append(_shown(item, item.signals, call.signal_degree, -math.inf))
+        features.append(_evaluate_features(item, item.signals, call.signal_degree, -math.inf))
     scene = (
         item.means, opacities, item.scales, item.quats, item.covars,
         item.means.detach() if degree is None else None,  # projection asks for colours; nothing shows these
         *harmonics, *camera, (*lens, call.eps2d, near), (*call.size, degree or 0, 2 * call.antialiased, 2),
     )  # fmt: skip
-    numbers = _numbers(view, item.view if degree else None, len(lens) > 3) if needs_function(view) else None
+    numbers = _camera_numbers(view, item.view if degree else None, len(lens) > 3) if needs_function(view) else None
     shared = Shared()
     train = needs_function(*item)
     how = shared, train if depth is None else None, numbers, None
@@ -205,7 +212,7 @@ def _project(call: Call, item: Item) -> _Projection:
     return _Projection(shared, splats, colored, shown, train, order, lists, counts, tuple(notes), rows)
 
 
-def _lens(call: Call, K: Tensor) -> tuple[float, ...]:
+def _lens_numbers(call: Call, K: Tensor) -> tuple[float, ...]:
     """The first numbers of Scene.lens. Of a pinhole no number goes to the host, which would wait for it."""
     if call.model == "pinhole":
         return 0.0, 0.0, 1.0
@@ -216,42 +223,42 @@ def _lens(call: Call, K: Tensor) -> tuple[float, ...]:
     return 0.0, 0.0, 1.0, *lens.numbers(width, height)
 
 
-def _numbers(view: Tensor, seen_from: Tensor | None, lens: bool) -> Tensor:
+def _camera_numbers(view: Tensor, seen_from: Tensor | None, lens: bool) -> Tensor:
     """The camera's numbers (camera.py), of which only the gradients of the pose are read: 15, then zeros.
 
     seen_from (4, 4): the pose whose centre colours depend on.
     """
     view = view.double()
-    center = view.new_zeros(3) if seen_from is None else _center(seen_from)
+    center = view.new_zeros(3) if seen_from is None else _camera_center(seen_from)
     return torch.cat([view[:3, :3].reshape(9), view[:3, 3], center, view.new_zeros(_NUMBERS[lens])])
 
 
-def _depth(call: Call, item: Item) -> Tensor | None:
+def _find_depths(call: Call, item: Item) -> Tensor | None:
     """Depths (N,) where they are not those that the kernels find."""
     if not call.by_z:
         return torch.linalg.vector_norm(item.means @ item.view[:3, :3].T + item.view[:3, 3], dim=1)
     return None if call.model == "pinhole" else item.means @ item.view[2, :3] + item.view[2, 3]
 
 
-def _shown(item: Item, values: Tensor, degree: int | None, least: float) -> Tensor:
+def _evaluate_features(item: Item, values: Tensor, degree: int | None, least: float) -> Tensor:
     """Values (N, D), or what SH (N, K, D) are in the directions from the camera, at least `least`."""
     if degree is None:
         return values
-    return (sh_values(degree, values, item.means - _center(item.view).to(item.means)) + 0.5).clamp_min(least)
+    return (sh_values(degree, values, item.means - _camera_center(item.view).to(item.means)) + 0.5).clamp_min(least)
 
 
-def _center(view: Tensor) -> Tensor:
+def _camera_center(view: Tensor) -> Tensor:
     """The place of a camera (3,), float64, by its view (4, 4)."""
     return torch.linalg.inv_ex(view.double())[0][:3, 3]
 
 
 @cache
-def _black(device: torch.device, dtype: torch.dtype) -> Tensor:
+def _make_black(device: torch.device, dtype: torch.dtype) -> Tensor:
     with torch.inference_mode(False):  # so that training can use it after a render in inference mode
         return torch.zeros(1, device=device, dtype=dtype)
 
 
-def _joined(
+def _join_notes(
     call: Call, notes: Sequence[tuple[Tensor, ...]], form: tuple[int, ...]
 ) -> tuple[list[Tensor], list[tuple[Tensor, ...]]]:
     """The notes of all images, and of each image what these are made of, so that images are made of the notes."""
@@ -275,7 +282,7 @@ def _blend(
     if call.absgrad and width + further > MOST_CHANNELS:
         raise ValueError(f"absgrad needs at most {MOST_CHANNELS} channels, got {width + further}")
     if behind is None:
-        behind = _black(item.means.device, item.means.dtype)
+        behind = _make_black(item.means.device, item.means.dtype)
     else:
         behind = behind.to(item.means)
         behind = torch.nn.functional.pad(behind, (0, further)) if further else behind
@@ -295,7 +302,7 @@ def _blend(
     return torch.cat([image[..., :width], image[..., end:]], -1), alpha, image[..., width:end], lists
 
 
-def _meta(
+def _make_meta(
     call: Call,
     notes: list[Tensor],
     lists: Sequence[tuple[Tensor, ...]],
@@ -334,7 +341,13 @@ def _hooks_of(values: Tensor) -> Callable[[], dict | None]:
 
 
 class _Lengths(NamedTuple):
-    """Puts the lengths of an image's absolute gradients, per NDC unit, into `absgrad` of means2d."""
+    """Writes the lengths of one image's absolute gradients into `absgrad` of means2d, for programs of gsplat.
+
+    means2d: weak reference to the tensor (..., C, N, 2), or (rows, 2) if it is packed.
+    place: index of the image among all images; if packed, the slice of its rows.
+    rows: Gaussians of these rows, int64; None if not packed.
+    width: width of the image, px.
+    """
 
     means2d: TensorWeakRef
     place: int | slice
@@ -342,6 +355,11 @@ class _Lengths(NamedTuple):
     width: int
 
     def __call__(self, lengths: Tensor) -> None:
+        """Write lengths (N,), per NDC unit, into column 0 of `absgrad`, which begins as zeros.
+
+        Programs of gsplat multiply the columns by half the width and half the height, and take the norm of both. Column
+        0 has the length times 2 / width, and column 1 stays 0, so that the norm is the length.
+        """
         if (means2d := self.means2d()) is None:
             return
         if getattr(means2d, "absgrad", None) is None:

@@ -28,6 +28,7 @@ class _Described(Function):
         ctx: Any, shared: Shared, size: tuple[int, int], packed: bool, splats: Tensor, depths: Tensor,
         tile_counts: Tensor,
     ) -> tuple[Tensor | None, ...]:  # fmt: skip
+        """Describe the splats, and keep what turns gradients of the description into moments."""
         with torch._C._AutoDispatchBelowAutograd():
             *found, tiles, rows = OPERATORS.describe(splats, depths, tile_counts, *size, packed)
         if packed:
@@ -45,6 +46,10 @@ class _Described(Function):
     @staticmethod
     @first_order("rasterization")
     def backward(ctx: Any, _: Any, centers: Tensor, of_depth: Tensor, conics: Tensor, opacities: Tensor, *__) -> tuple:
+        """Return the moments that blending has sent, corrected where gradients of the description differ from these.
+
+        The gradients differ if a hook has changed them, or if a loss depends on the description.
+        """
         splats, tile_counts, rows, radii = ctx.saved_tensors
         moments, marks = ctx.shared.take()
         given = [centers, conics, opacities]
@@ -59,10 +64,10 @@ class _Described(Function):
         if not same:
             moments = torch.zeros_like(splats) if moments is None else moments
             sent = OPERATORS.describe_vjp(splats, tile_counts, moments)
-            dense = [own if got is None else _dense(got, rows, splats) for got, own in zip(given, sent, strict=True)]
-            moments = _with_changes(moments, splats, shown, sent, dense)
+            dense = [own if got is None else _to_dense(got, rows, splats) for got, own in zip(given, sent, strict=True)]
+            moments = _merge_changes(moments, splats, shown, sent, dense)
         if of_depth is not None:
-            of_depth = torch.where(shown > 0, _dense(of_depth, rows, splats), 0)
+            of_depth = torch.where(shown > 0, _to_dense(of_depth, rows, splats), 0)
         return None, None, None, moments, of_depth, None
 
 
@@ -72,14 +77,14 @@ def describe_moments(splats: Tensor, tile_counts: Tensor, moments: Tensor, rows:
     return [values[None] for values in found] if rows is None else found
 
 
-def _dense(packed: Tensor, rows: Tensor | None, splats: Tensor) -> Tensor:
+def _to_dense(packed: Tensor, rows: Tensor | None, splats: Tensor) -> Tensor:
     """A value for each Gaussian, of a gradient of `_Described`."""
     if rows is None:
         return packed[0]
     return packed.new_zeros(len(splats), *packed.shape[1:]).index_copy_(0, rows, packed)
 
 
-def _with_changes(
+def _merge_changes(
     moments: Tensor, splats: Tensor, shown: Tensor, sent: Sequence[Tensor], given: Sequence[Tensor]
 ) -> Tensor:
     """Moments, but of what is given where that is not what was sent: gradients of means2d, conics and opacities."""

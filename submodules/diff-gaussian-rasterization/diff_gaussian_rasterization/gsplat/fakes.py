@@ -19,6 +19,7 @@ def _(pose, intrinsics, height, width):
 
 @fake("describe")
 def _(splats, depths, tile_counts, height, width, packed=False):
+    """Return empty radii, means2d, depths, conics, opacities, tiles and rows; any number of rows if packed."""
     count = library.get_ctx().new_dynamic_size() if packed else splats.shape[0]
     floats = (splats.new_empty((count, *row)) for row in ((2,), (), (3,), ()))
     listed = (count if packed else 0,)

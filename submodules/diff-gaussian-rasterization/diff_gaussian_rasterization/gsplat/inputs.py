@@ -64,7 +64,7 @@ class Item(NamedTuple):
     background: Tensor | None  # (D,)
 
 
-def checked(given: dict[str, Any]) -> tuple[Call, Tensor | None, int]:
+def check_call(given: dict[str, Any]) -> tuple[Call, Tensor | None, int]:
     """Check the arguments of `rasterization`. Return the call, the backgrounds and tile_size.
 
     ValueError, or TypeError, for wrong arguments.
@@ -118,8 +118,14 @@ def _check_renderer(config: Any) -> None:
     raise ValueError(f"renderer_config {name} needs with_eval3d=True, which is not supported; {_NO_RAYS}")
 
 
-def items_of(call: Call, given: Item, form: tuple[int, ...]) -> list[Item]:
-    """Split the arguments into images. ValueError for tensors of wrong shapes or dtypes."""
+def split_images(call: Call, given: Item, form: tuple[int, ...]) -> list[Item]:
+    """Split the arguments of a call into those of its images: batch by batch, and in each camera by camera.
+
+    ValueError for tensors of wrong shapes or dtypes.
+
+    given: tensors of the call, with axes of batches, and of cameras where the argument has them.
+    form: numbers of batches, one for each axis of batches, then the number of cameras.
+    """
     if not all(form):
         raise ValueError(f"there must be an image to render, got batches and cameras {form}")
     if given.covars is not None:
@@ -133,14 +139,14 @@ def items_of(call: Call, given: Item, form: tuple[int, ...]) -> list[Item]:
     axes = 2, 2, 2, 2, 1, 2 + (call.degree is not None), 2 + (call.signal_degree is not None), 2, 2, 1
     images = []
     for place in range(math.prod(batch)):
-        own = [_part(values, len(batch), n, place) for values, n in zip(given, axes, strict=True)]
+        own = [_select_batch(values, len(batch), n, place) for values, n in zip(given, axes, strict=True)]
         for camera in range(cameras):
             of_camera = (v if v is None or v.dim() == n else v[camera] for v, n in zip(own, axes, strict=True))
             images.append(Item(*of_camera))
     return images
 
 
-def _part(values: Tensor | None, batch: int, axes: int, place: int) -> Tensor | None:
+def _select_batch(values: Tensor | None, batch: int, axes: int, place: int) -> Tensor | None:
     """Return the values of one batch; all values, where they have no axes of batches.
 
     batch: number of leading axes of batches.
@@ -153,6 +159,10 @@ def _part(values: Tensor | None, batch: int, axes: int, place: int) -> Tensor | 
 
 
 def _check_shapes(call: Call, given: Item, form: tuple[int, ...]) -> None:
+    """Raise ValueError for a tensor whose shape or dtype does not fit the call.
+
+    form: numbers of batches, then of cameras.
+    """
     batch, means = (form[:-1],), given.means
     count, each, both = means.shape[-2], (form,), (form[:-1], form)
     shapes = [("means", means, batch, (count, 3)), ("opacities", given.opacities, batch, (count,))]

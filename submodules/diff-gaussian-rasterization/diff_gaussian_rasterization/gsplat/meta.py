@@ -28,14 +28,15 @@ class Meta(dict):
         self._form, self._lists, self._rows = form, lists, rows
 
     def __missing__(self, name: str) -> Tensor:
+        """Make the lists of tiles when the name of one is first read. KeyError for other names."""
         if name not in _LISTS:
             raise KeyError(name)
         if self["tile_size"] != _TILE:
             raise ValueError(f"{name} is known for a tile_size of {_TILE} alone, got {self['tile_size']}")
-        self.update(zip(_LISTS, self._made(), strict=True))
+        self.update(zip(_LISTS, self._make_lists(), strict=True))
         return self[name]
 
-    def _made(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _make_lists(self) -> tuple[Tensor, Tensor, Tensor]:
         """Ids (I,) int64: image, tile and depth, as bits; numbers (I,) int32 of rows; beginnings (..., C, H, W)."""
         tiles = self["tile_width"] * self["tile_height"]
         ids, numbers, begins, instances_before, rows_before = [], [], [], 0, 0

@@ -52,14 +52,21 @@ def nearest_first(
 
 
 def blend_rows(splats: Splats, background: Tensor, rays: Tensor | None, rows: range, width: int, cut: float) -> Planes:
-    """Blends image rows: C = sum of c_i alpha_i T_i, where T_i is the product of 1 - alpha_j over nearer splats j."""
+    """Blend image rows: C = sum of c_i alpha_i T_i, where T_i is the product of 1 - alpha_j over nearer splats j.
+
+    background: (3,).
+    rays: (H, W, 3), directions of a lens's pixels; None for EWA and for pinholes.
+    rows: rows of the image to blend.
+    cut: relative distance from LEAST_ALPHA or LEAST_TRANSMITTANCE, within which rounding may decide what a pixel
+        blends. Such pixels are true in `near_cut` of the result, as are those with a depth tie.
+    """
     uncapped = alphas(splats, rows, width) if splats.slopes is None else ray_alphas(splats, rays, rows, width)
     reached = uncapped >= LEAST_ALPHA
     alpha = uncapped + (torch.clamp(uncapped, max=LARGEST_ALPHA) - uncapped).detach()  # the gradient passes the cap
     alpha = torch.where(reached, alpha, 0.0)
     left = torch.cumprod(1 - alpha, 0)  # transmittance behind each splat, if all were blended
-    is_near = _is_near(uncapped, LEAST_ALPHA, cut) | _is_near(left, LEAST_TRANSMITTANCE, cut)
-    is_near = is_near | (splats.is_tie[:, None, None] & reached)
+    may_flip = _is_near_limit(uncapped, LEAST_ALPHA, cut) | _is_near_limit(left, LEAST_TRANSMITTANCE, cut)
+    may_flip = may_flip | (splats.is_tie[:, None, None] & reached)
 
     alpha = torch.where(left >= LEAST_TRANSMITTANCE, alpha, 0.0)
     behind = torch.cumprod(1 - alpha, 0)
@@ -68,12 +75,12 @@ def blend_rows(splats: Splats, background: Tensor, rays: Tensor | None, rows: ra
     weight = alpha * T
     color = torch.einsum("nhw,nc->chw", weight, splats.color) + transmittance * background[:, None, None]
     inverse_depth = (weight / splats.depth[:, None, None]).sum(0)
-    return Planes(color, inverse_depth, transmittance, is_near.any(0))
+    return Planes(color, inverse_depth, transmittance, may_flip.any(0))
 
 
 def alphas(splats: Splats, rows: range, width: int) -> Tensor:
     """Opacity times the Gaussian of Kerbl et al. 2023, eq. 4, on the image: (M, rows, W)."""
-    u, v = _whitened(splats, *_offsets(splats, rows, width))
+    u, v = _whiten(splats, *_offsets_to_pixels(splats, rows, width))
     return splats.opacity[:, None, None] * torch.exp(-0.5 * (u * u + v * v))
 
 
@@ -81,29 +88,30 @@ def ray_alphas(splats: Splats, rays: Tensor | None, rows: range, width: int) -> 
     """Opacity times exp(-D^2 / 2) of `reference.ray`: (M, rows, W). rays (H, W, 3): of a lens."""
     g, e, of_rays = splats.slopes
     if of_rays is None:
-        (dx, dy), depth = _offsets(splats, rows, width), 1.0
+        (dx, dy), depth = _offsets_to_pixels(splats, rows, width), 1.0
     else:
         dx, dy, depth = torch.einsum("nik,hwk->inhw", of_rays, rays[rows.start : rows.stop])
     s = depth + g[:, 0, None, None] * dx + g[:, 1, None, None] * dy
-    u, v = _whitened(splats, dx, dy)
+    u, v = _whiten(splats, dx, dy)
     q, hit = u * u + v * v, s > 0
     square = q / (torch.where(hit, s, 1.0) ** 2 + e[:, None, None] * q)
     return torch.where(hit, splats.opacity[:, None, None] * torch.exp(-0.5 * square), 0.0)
 
 
-def _offsets(splats: Splats, rows: range, width: int) -> tuple[Tensor, Tensor]:
+def _offsets_to_pixels(splats: Splats, rows: range, width: int) -> tuple[Tensor, Tensor]:
     """From a splat's mean to a pixel, px: (M, 1, W) and (M, rows, 1)."""
     x = torch.arange(width, dtype=torch.float64)
     y = torch.arange(rows.start, rows.stop, dtype=torch.float64)
     return x[None, None, :] - splats.pixel[:, 0, None, None], y[None, :, None] - splats.pixel[:, 1, None, None]
 
 
-def _whitened(splats: Splats, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
+def _whiten(splats: Splats, dx: Tensor, dy: Tensor) -> tuple[Tensor, Tensor]:
     """(u, v) with covariance = R^T R and R^T (u, v) = (dx, dy): -(u^2 + v^2) / 2 cannot become positive."""
     r11, r12, r22 = (t[:, None, None] for t in (splats.r11, splats.r12, splats.r22))
     u = dx / r11
     return u, (dy - r12 * u) / r22
 
 
-def _is_near(values: Tensor, limit: float, cut: float) -> Tensor:
+def _is_near_limit(values: Tensor, limit: float, cut: float) -> Tensor:
+    """Tell which values lie within a relative distance `cut` of a limit, in the shape of the values."""
     return (values * (1 / limit) - 1).abs() < cut

@@ -62,18 +62,22 @@ def camera_of(settings: GaussianRasterizationSettings) -> Camera:
 
 def project(means: Tensor, means2d: Tensor, camera: Camera) -> Points:
     """Projects means (N, 3) and adds means2d (N, 3), in NDC: zeros, whose gradient is that of the projected means."""
-    view = _transformed(means, camera.world_to_view)[:, :3]
-    clip = _transformed(means, camera.world_to_clip)
+    view = _transform(means, camera.world_to_view)[:, :3]
+    clip = _transform(means, camera.world_to_clip)
     shift = means2d[:, :2] * camera.size / 2
     if camera.lens is not None:
-        return _through_lens(view, shift, camera)
+        return _project_by_lens(view, shift, camera)
     in_front = view[:, 2] > camera.near
     depth = torch.where(in_front, view[:, 2], 1.0)
     ndc = clip[:, :2] / torch.where(in_front, clip[:, 3], 1.0)[:, None]
     return Points(view, in_front, depth, ((ndc + 1) * camera.size - 1) / 2 + shift, shift)
 
 
-def _through_lens(view: Tensor, shift: Tensor, camera: Camera) -> Points:
+def _project_by_lens(view: Tensor, shift: Tensor, camera: Camera) -> Points:
+    """Project points (N, 3) of the view by the camera's lens.
+
+    shift: (N, 2) px, added to the pixels.
+    """
     lens = camera.lens
     _, limit, *_ = lens.numbers(camera.width, camera.height)
     depth = view[:, 2] if lens.chart == "perspective" else view.norm(dim=1)
@@ -89,7 +93,7 @@ def world_to_image(points: Points, camera: Camera) -> Tensor:
 
     Means far outside the image count as lying at RAY_LIMIT, where J is still moderate.
     """
-    return jacobians(points._replace(view=_clamped(points, camera)), camera) @ camera.world_to_view[:3, :3].T
+    return jacobians(points._replace(view=_clamp_to_limit(points, camera)), camera) @ camera.world_to_view[:3, :3].T
 
 
 def jacobians(points: Points, camera: Camera) -> Tensor:
@@ -103,7 +107,7 @@ def jacobians(points: Points, camera: Camera) -> Tensor:
     return torch.stack(across + down, -1).reshape(-1, 2, 3)
 
 
-def _clamped(points: Points, camera: Camera) -> Tensor:
+def _clamp_to_limit(points: Points, camera: Camera) -> Tensor:
     """The points (N, 3) of the same depth on rays within RAY_LIMIT, where rays are a pinhole's."""
     if camera.lens is None:
         low, high = ((limit - camera.principal) * camera.tangents for limit in (-RAY_LIMIT, RAY_LIMIT))
@@ -119,6 +123,6 @@ def _clamped(points: Points, camera: Camera) -> Tensor:
     return torch.cat([ray * points.depth[:, None], points.view[:, 2:]], 1)
 
 
-def _transformed(points: Tensor, matrix: Tensor) -> Tensor:
+def _transform(points: Tensor, matrix: Tensor) -> Tensor:
     """Points (N, 3) in homogeneous coordinates, transformed: (N, 4)."""
     return torch.cat([points, torch.ones_like(points[:, :1])], 1) @ matrix

@@ -33,6 +33,10 @@ def sh_basis(directions: Tensor) -> Tensor:
 
 
 def _degrees_1_and_2(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    """Return the eight harmonics of degrees 1 and 2 at unit directions, each (N,).
+
+    x, y, z: coordinates of the directions, (N,).
+    """
     linear = (3 / (4 * torch.pi)) ** 0.5
     mixed, zonal = 0.5 * (15 / torch.pi) ** 0.5, 0.25 * (5 / torch.pi) ** 0.5
     return [
@@ -48,6 +52,10 @@ def _degrees_1_and_2(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
 
 
 def _degree_3(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    """Return the seven harmonics of degree 3 at unit directions, each (N,).
+
+    x, y, z: coordinates of the directions, (N,).
+    """
     outer, inner = 0.25 * (35 / (2 * torch.pi)) ** 0.5, 0.25 * (21 / (2 * torch.pi)) ** 0.5  # orders 3 and 1
     mixed, zonal = (105 / torch.pi) ** 0.5, 0.25 * (7 / torch.pi) ** 0.5
     return [

@@ -25,7 +25,7 @@ def pixels(lens: Lens, points: Tensor) -> Tensor:
 
 def pixels_of(lens: Lens, numbers: Tensor) -> Tensor:
     """Pixels (..., 2) of numbers (..., 2) of the lens's chart."""
-    found = _distorted(lens, numbers)
+    found = _distort(lens, numbers)
     return found * torch.tensor(lens.focal, dtype=numbers.dtype) + torch.tensor(lens.center, dtype=numbers.dtype)
 
 
@@ -39,7 +39,7 @@ def rays(lens: Lens, width: int, height: int) -> Tensor:
     y, x = (t.double() for t in torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij"))
     found = numbers_of(lens, torch.stack([x, y], -1).reshape(-1, 2), width, height)
     solved = found.isfinite().all(1)
-    return torch.where(solved[:, None], _directions(lens, found), 0.0).reshape(height, width, 3)
+    return torch.where(solved[:, None], _to_directions(lens, found), 0.0).reshape(height, width, 3)
 
 
 def numbers_of(lens: Lens, places: Tensor, width: int, height: int) -> Tensor:
@@ -49,21 +49,21 @@ def numbers_of(lens: Lens, places: Tensor, width: int, height: int) -> Tensor:
     """
     focal, center = (torch.tensor(t, dtype=torch.float64) for t in (lens.focal, lens.center))
     wanted = (places - center) / focal
-    found, of_one = wanted.clone(), torch.func.jacrev(lambda numbers: _distorted(lens, numbers))
+    found, of_one = wanted.clone(), torch.func.jacrev(lambda numbers: _distort(lens, numbers))
     for _ in range(_STEPS):
-        off = _distorted(lens, found) - wanted
+        off = _distort(lens, found) - wanted
         (xx, xy), (yx, yy) = torch.func.vmap(of_one)(found).permute(1, 2, 0)
         step = torch.stack([yy * off[:, 0] - xy * off[:, 1], xx * off[:, 1] - yx * off[:, 0]], 1)
         found = found - step / (xx * yy - xy * yx)[:, None]
         if (step.abs().nan_to_num(0) < 1e-16).all():
             break
-    solved = (_distorted(lens, found) - wanted).abs().amax(1) < _SOLVED
+    solved = (_distort(lens, found) - wanted).abs().amax(1) < _SOLVED
     _, limit, _, *_ = lens.numbers(width, height)
     solved &= found.square().sum(1) <= limit
     return torch.where(solved[:, None], found, torch.nan)
 
 
-def _distorted(lens: Lens, numbers: Tensor) -> Tensor:
+def _distort(lens: Lens, numbers: Tensor) -> Tensor:
     """Distort numbers (..., 2) of the chart, by Brown 1966 and Weng et al. 1992."""
     a, b = numbers.unbind(-1)
     q, (p1, p2) = a * a + b * b, lens.tangential
@@ -73,7 +73,7 @@ def _distorted(lens: Lens, numbers: Tensor) -> Tensor:
     return torch.stack([across, down], -1)
 
 
-def _directions(lens: Lens, numbers: Tensor) -> Tensor:
+def _to_directions(lens: Lens, numbers: Tensor) -> Tensor:
     """Return the directions (N, 3) of a chart's numbers (N, 2); 0 for numbers without a direction."""
     a, b = numbers.unbind(1)
     if lens.chart == "perspective":

@@ -39,7 +39,7 @@ def activated(raw: Gaussians) -> Gaussians:
     return raw._replace(
         opacities=torch.sigmoid(raw.opacities),
         scales=None if raw.scales is None else raw.scales.exp(),
-        rotations=None if raw.rotations is None else _normalised(raw.rotations),
+        rotations=None if raw.rotations is None else _normalise(raw.rotations),
     )
 
 
@@ -60,7 +60,7 @@ def ellipses_of(JW: Tensor, RS: Tensor | None, Sigma: Tensor | None, dilation: f
     """The dilated ellipses of Gaussians of `in_space` under linear maps JW (N, 2, 3)."""
     if RS is None:
         return _factor_of_covariance(JW @ Sigma @ JW.transpose(1, 2), dilation)
-    return _factor(JW @ RS, dilation)
+    return _factor_half(JW @ RS, dilation)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
@@ -100,14 +100,14 @@ def radii(points: Points, ellipses: Ellipses, camera: Camera) -> Tensor:
     return torch.where(points.in_front & on_image, radius, 0.0).to(torch.int32)
 
 
-def _normalised(quaternions: Tensor) -> Tensor:
+def _normalise(quaternions: Tensor) -> Tensor:
     length = quaternions.norm(dim=1, keepdim=True)
     is_zero = length < 1e-30
     identity = torch.tensor([1.0, 0, 0, 0], dtype=quaternions.dtype)
     return torch.where(is_zero, identity, quaternions / torch.where(is_zero, 1.0, length))
 
 
-def _factor(half: Tensor, dilation: float) -> Ellipses:
+def _factor_half(half: Tensor, dilation: float) -> Ellipses:
     """The ellipses of half half^T + dilation I, where half (N, 2, 3) is J W R S."""
     across, down = half.unbind(1)
     xx, xy, yy = (across * across).sum(1), (across * down).sum(1), (down * down).sum(1)

@@ -151,6 +151,7 @@ void by_kind_of_rows(const Scene<float>& s, const Run& run) {
   else
     run(std::integral_constant<int, kNoRays>());
 }
+// The same, also for rows of Gaussians on the rays of a lens.
 template <class Run>
 void by_kind(const Scene<float>& s, const Run& run) {
   if (s.rows()) by_rays(s.rays(), run);

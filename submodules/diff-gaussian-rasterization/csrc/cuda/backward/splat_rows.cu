@@ -113,6 +113,7 @@ struct Words {
   __host__ __device__ WordAt operator()(int64_t splat) const { return {in, slots, before, splat}; }
 };
 
+// Finds where the gradient rows of each splat begin, by a sum over the counts of the splats before it.
 void lay_out(const Queue& queue, const SplatRows<float>& in, SplatSlots* slots, int32_t* before) {
   const thrust::counting_iterator<int64_t> splats(0);
   const auto counts = thrust::make_transform_iterator(splats, SeenAndRows{in});
@@ -142,6 +143,7 @@ void count_rows(const Queue& queue, int64_t count, const RowPlaces& rows, const 
   launch(queue, "count_rows", count_rows_kernel, blocks_for(count, kThreads), kThreads, count, rows, slots, counts);
 }
 
+// Writes rows of gradients and of absolute gradients, which are filled apart, as one row each.
 template <int kRays>
 void join_rows(const Queue& queue, int64_t rows, const FilledRows<kRays>& from, float* to) {
   const auto both = halves<kRays>(from.gradients.values, from.absolute.values);
