@@ -1,8 +1,8 @@
 # make demo   a scene made, trained, rendered and scored
 # make test   lint, format check, C++ tests of the CPU, pytest but for slow tests: three to five minutes
-# make check  make test, CUDA kernels emulated, and slow tests; what CI runs
+# make check  make test, CUDA kernels emulated, and slow tests, but neither browser nor npm
 # make check-core, check-applications   the Python tests of make check in two halves: those of the core, in a copy of the
-#             repository without applications and benchmarks; and those that need these. What CI runs in place of make check
+#             repository without applications and benchmarks; and those that need these. `.ci/run` has them in place of check
 # make test-aarch64, test-windows, test-macos   the C++ tests, built for another platform and run under an emulator
 # make test-browser   the tests that need Chromium, which is installed first where Debian's package manager may be used;
 #             without npm, those of other people's viewers skip

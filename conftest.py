@@ -42,7 +42,7 @@ def _list_rooms(path: Path) -> set[str]:
 def pytest_ignore_collect(collection_path: Path) -> bool | None:
     """Leave out a test that imports an application or benchmarks, if that folder was deleted.
 
-    GS_TESTS=applications leaves out all others: what `make check-core` runs.
+    GS_TESTS=applications, which `make check-applications` sets, leaves out the tests that import neither.
     """
     if collection_path.suffix != ".py":
         return None

@@ -76,7 +76,7 @@ class Adc(Strategy):
     def densify(self, iteration: int, limit_size: bool) -> None:
         """Clone, split and prune by the statistics, which then start anew.
 
-        limit_size: true to prune what is large on screen.
+        limit_size: true to prune what is large in the scene, as the reference does from its first reset on.
         """
         gaussians, most = self._gaussians, self.max_gaussians
         gaussians.densify_and_prune(
