@@ -233,3 +233,9 @@ def test_stlpips_is_the_packages(monkeypatch):
     monkeypatch.setattr(lpips_utils, "_OF_STLPIPS", "0" * 64)
     with pytest.raises(UserError, match="alex_shift_tolerant.pth is damaged: .*; install stlpips-pytorch again"):
         lpips_utils.load_stlpips(CPU)
+
+
+def test_weights_have_the_addresses_of_torchvision():
+    import_lpips()
+    weights = importlib.import_module("torchvision.models").get_model_weights
+    assert all(lpips_utils._find_url(net) == weights(name).IMAGENET1K_V1.url for net, name in NETS.items())
