@@ -238,4 +238,7 @@ def test_stlpips_is_the_packages(monkeypatch):
 def test_weights_have_the_addresses_of_torchvision():
     import_lpips()
     weights = importlib.import_module("torchvision.models").get_model_weights
-    assert all(lpips_utils._find_url(net) == weights(name).IMAGENET1K_V1.url for net, name in NETS.items())
+    assert all(
+        f"{lpips_utils._SITE}/{lpips_utils._FILES[net]}" == weights(name).IMAGENET1K_V1.url
+        for net, name in NETS.items()
+    )

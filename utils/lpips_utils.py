@@ -86,8 +86,10 @@ def load_network(net: str, folder: Path | None, device: torch.device) -> nn.Modu
     folder: the folder of torchvision's file of the backbone, under its own name; None: torch's cache, then a download.
     Raises LpipsUnavailable without weights, and UserError for a missing or wrong file.
     """
-    state = _load_from_cache(net) if folder is None else _load_state(weights_file(net, folder))
+    # The import takes seconds, which nobody should wait for who has no weights.
+    state = _load_from_cache(net) if folder is None else None
     lpips = import_lpips()
+    state = state or _load_state(weights_file(net, folder))
     with _without_weights(net):
         model = lpips.LPIPS(net=net, pnet_rand=True, verbose=False)
     _fill(model.net, state, net)
