@@ -135,11 +135,18 @@ def read_training_options(model_path: str | os.PathLike) -> dict[str, Value]:
 def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Parse the command line and take options that were not typed from the model folder that -m names.
 
-    Typed options win; flags can only be switched on. The parser's model options must default to None
-    (`ModelParams(parser, sentinel=True)`). `typed_sh_degree` is the degree that was typed, or None, since a saved PLY
-    may have another degree than cfg_args; `other_scene` the name of the scene if -s names another one than the model's,
-    else empty; `marks` what names of folders of pictures end with, by the options that draw or compare them in another
-    way than the model's. With --ply, the folder may be a new one. UserError without -m or without a readable cfg_args.
+    Typed options win; flags can only be switched on. UserError without -m or without a readable cfg_args. With --ply,
+    the file is the model, and -m may name a folder without cfg_args, such as a new one: nothing is taken from it.
+
+    parser: its model options must default to None (`ModelParams(parser, sentinel=True)`).
+    argv: words of the command line; None: those of the program.
+
+    Returns the options, with three attributes that no option has:
+
+    typed_sh_degree: the --sh_degree that was typed, or None: a saved PLY may have another degree than cfg_args.
+    other_scene: name of the scene that -s names, if it is not the one that the model was trained on; else empty.
+    marks: ending for the names of folders of pictures, such as _r2. It lists the options, typed otherwise than stored,
+        that change how views are drawn or compared, so that these pictures replace no others; empty without any.
     """
     args = parser.parse_args(argv)
     if not getattr(args, "model_path", None):
@@ -155,7 +162,7 @@ def get_combined_args(parser: argparse.ArgumentParser, argv: Sequence[str] | Non
 
 
 def _list_marks(stored: Mapping[str, Value], typed: Mapping[str, Value]) -> Iterator[str]:
-    """The ends of names: of each option that was typed and is not as stored, sorted; as in _r2."""
+    """Yield a part of a folder's name, such as _r2, for each option that was typed otherwise than stored, sorted."""
     for name in sorted(stored.keys() & typed.keys() - _UNSEEN):
         value = typed[name]
         if value == stored[name] or (name, stored[name]) == ("appearance", "none"):  # then nothing has trained

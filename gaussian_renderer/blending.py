@@ -61,12 +61,12 @@ def view_planes(
     return {"depth": drawn["depth"], "alpha": drawn["render"][:1]}
 
 
-def blend_depth(
+def count_list_entries(
     camera: Camera | MiniCam, gaussians: GaussianModel, pipe: argparse.Namespace, scaling: float = 1.0
 ) -> Tensor:
-    """Count the entries of its tile's list up to the last Gaussian that is blended into a pixel: (H, W) int32.
+    """Count for each pixel the Gaussians that its tile lists, up to the last one that is blended: (H, W) int32.
 
-    The count is the pixel's work: Gaussians of the tile that miss the pixel count, those behind the last one do not.
+    The count is the work of the pixel: Gaussians of the list that miss the pixel count, too.
 
     scaling: factor of all scales.
     """

@@ -37,11 +37,14 @@ _CALIBRATED = {
 
 
 class Pair(NamedTuple):
-    """Two photos of a model.
+    """Two photos that match each other, and how well a model explains their matches.
 
-    error, own_error: median epipolar errors (pixels) by the model and by the pair's own best geometry.
-    side: the longest side of the photos, pixels.
-    behind: share of the matches that the model puts behind a photo.
+    first, second: names of the photos.
+    matches: number of matches that were judged.
+    error: median epipolar error of the matches under the model's poses and lenses, pixels.
+    own_error: the same under the geometry that fits this pair alone best.
+    side: the longest side of the first photo, pixels.
+    behind: share of the matches whose rays the model lets meet behind a camera, 0 to 1.
     """
 
     first: str
@@ -69,7 +72,7 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
     """
     compared = sorted(find_overlaps(model, database), key=lambda pair: -pair.empty)
     alike = [pair[:2] for pair in compared if pair.is_unmatched]
-    return verdict(list(pairs_of(model, database))) | {
+    return verdict(list(judge_pairs(model, database))) | {
         "bound": len(largest_component(_list_linked_pairs(database))),
         "rotation": rotation_error(database),
         "alike": find_cover(alike),
@@ -105,8 +108,14 @@ def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
     }
 
 
-def pairs_of(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
-    """The pairs of a database whose photos both have a pose in the model."""
+def judge_pairs(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
+    """Judge the pairs of photos that COLMAP has matched by a model (`judge_pair`), and yield one Pair for each.
+
+    Pairs are skipped if one photo has no pose in the model, if their focal lengths are not known well enough or they
+    show no depth (_CALIBRATED), or if they have fewer than FEWEST matches.
+
+    path: file of COLMAP's database, which has the pairs and their verified matches.
+    """
     database = pycolmap.Database.open(path)
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     images = {one.image_id: posed[one.name] for one in database.read_all_images() if one.name in posed}
@@ -121,10 +130,11 @@ def pairs_of(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
     database.close()
 
 
-def pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
-    """Pairs of photos that share points of the model, where it has no database: for each photo those that share most.
+def judge_pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
+    """Judge pairs of photos that share points of a model, for a model without a database; yield one Pair for each.
 
-    They prove little if a program has removed matches that did not fit.
+    Each photo is paired with the _SHARING others that share most points with it, FEWEST at least. The points' places in
+    the photos stand for matches. These pairs prove little if a program has removed matches that did not fit.
     """
     images = {number: model.images[number] for number in model.reg_image_ids()}
     seen: dict[int, dict[int, int]] = {number: {} for number in images}
@@ -148,7 +158,11 @@ def pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
 
 
 def judge_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, seen: np.ndarray) -> Pair | None:
-    """Judge the unit rays (N, 3) of matches in two photos by the photos' poses; None if there are too few."""
+    """Judge a pair of photos by their poses: a Pair, or None with fewer than FEWEST usable matches.
+
+    rays, seen: unit rays (N, 3) of the matches in the first and in the other photo, each in its camera's frame; a match
+        whose ray is not finite is left out.
+    """
     usable = np.isfinite(rays).all(1) & np.isfinite(seen).all(1)
     rays, seen = rays[usable], seen[usable]
     if len(rays) < FEWEST:
@@ -205,7 +219,11 @@ def own_angles(rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def consistent_groups(pairs: Iterable[Pair]) -> list[list[str]]:
-    """Groups of photos, the largest first: join the two with the most votes between them while these are positive."""
+    """Group the photos of pairs so that pairs within a group agree with the model, and pairs between groups contradict.
+
+    A pair votes by its matches, for or against its two photos in one group (`_weigh_pair`). The two groups with the
+    most votes between them are joined, while these are positive. Returns lists of names, the largest group first.
+    """
     votes: dict[str, dict[str, float]] = {}
     for pair in pairs:
         for one, other in ((pair.first, pair.second), (pair.second, pair.first)):
@@ -255,6 +273,7 @@ def _list_linked_pairs(path: str) -> list[tuple[int, int]]:
 
 
 def _weigh_pair(pair: Pair) -> float:
+    """Return the vote of a pair: its number of matches, _HEARD at most, negative if it contradicts the model."""
     return min(pair.matches, _HEARD) * (-1.0 if pair.contradicts else 1.0)
 
 

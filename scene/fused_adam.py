@@ -49,7 +49,10 @@ class FusedAdam:
         )
 
     def arguments(self, observe: bool) -> "StepArguments":
-        """Arguments of the operator for the next step. observe: with the statistics."""
+        """Return the arguments of the operator for the next step.
+
+        observe: true to add the view to the statistics of density control.
+        """
         optimizer, stepping = self._gaussians.optimizer, list(self._list_stepping())
         each = self._penalty.per_value(self._gaussians.gaussian_count)
         *guard, iteration = (optimizer.guard and optimizer.guard.arguments) or (0,)
@@ -85,7 +88,7 @@ class FusedAdam:
         view to the statistics, with sums of absolute gradients. now: see `write_now`, None: no recorded step.
 
         camera: (CAMERA_NUMBERS,) float64 on the Gaussians' device, gets the gradients of the camera's numbers before
-        the step. awake: of scene/sleeping.py, None: all are.
+        the step. awake: the blocks of Gaussians that do not sleep, from `Sleeping.wake`; None: all.
         """
         gaussians, view, *options = scene.lists
         view = view if awake is None else (*view, awake)
@@ -125,7 +128,12 @@ class FusedAdam:
         return statistics.max_radii2D, statistics.xyz_gradient_accum, statistics.denom
 
     def _list_stepping(self) -> Iterator["_Stepping"]:
-        """The attributes that step, in the operator's order."""
+        """Yield the attributes that take part in the next step, in the operator's order.
+
+        Active columns are the leading values of each row that may have a gradient, such as the SH coefficients up to
+        the active degree (`GaussianAdam.set_active_columns`). Sparse Adam passes over an attribute without any; of the
+        others, such an attribute's step counter advances.
+        """
         optimizer, sparse = self._gaussians.optimizer, self._sparse
         groups = {group["name"]: group for group in optimizer.param_groups}
         for place, name in enumerate(_STEPPED):
@@ -146,17 +154,19 @@ class StepArguments(NamedTuple):
     attributes: list[int]  # places in gs::Stepped
     rates: list[float]
     constants: list[float]  # beta1, beta2, eps, penalties of opacities and of scales
-    columns: list[int]
-    sparse: bool
+    columns: list[int]  # leading values of each row that step, -1: all
+    sparse: bool  # only Gaussians that the view shows step
     iteration: int
 
 
 class _Stepping(NamedTuple):
+    """An attribute that takes part in a step."""
+
     attribute: int  # its place in gs::Stepped
     param: Tensor
-    state: dict[str, Tensor]
-    rate: float
-    columns: int
+    state: dict[str, Tensor]  # the optimiser's: step, exp_avg, exp_avg_sq
+    rate: float  # learning rate
+    columns: int  # active ones, -1: all
 
 
 def _is_plain(param: Tensor) -> bool:

@@ -1,4 +1,7 @@
-"""Poses from the tracks of structure from motion: reprojection errors of fixed points."""
+"""Poses from the tracks of structure from motion: reprojection errors of fixed points.
+
+A twist (6,) is a small motion of a camera in its own frame: a rotation vector (radians), then a translation.
+"""
 
 import math
 from typing import NamedTuple
@@ -16,13 +19,13 @@ _BEHIND = 3.0  # radians from the axis; beyond, the smallest turn moves a fishey
 
 
 class PoseLoss(NamedTuple):
-    """The reprojection error of a pose: a sum of Huber losses (pixels squared), and its gradient (6,) by a twist."""
+    """The reprojection error of a photo's K points in a pose, and its derivatives by a twist."""
 
-    loss: float
-    gradient: np.ndarray
-    slope: np.ndarray  # (2, 6, K): of the points' pixels
-    weight: np.ndarray  # (K,)
-    size: np.ndarray  # (K,): errors, in pixels
+    loss: float  # sum of the points' Huber losses, pixels squared
+    gradient: np.ndarray  # (6,), of the loss by the twist
+    slope: np.ndarray  # (2, 6, K), of the points' pixels by the twist; 0 for points that do not count
+    weight: np.ndarray  # (K,), 1, less for outliers: Huber's weights of least squares
+    size: np.ndarray  # (K,), errors, pixels
 
     @property
     def curvature(self) -> np.ndarray:
@@ -31,7 +34,11 @@ class PoseLoss(NamedTuple):
 
 
 def moved_pose(pose: np.ndarray, twist: np.ndarray, unit: float) -> np.ndarray:
-    """Move a world-to-camera matrix (4, 4) by a twist (6,) in the camera's frame, whose translation counts in `unit`.
+    """Move a pose by a twist, and return the new pose (4, 4).
+
+    pose: world-to-camera matrix (4, 4).
+    twist: (6,), a rotation vector (radians) and a translation (units), in the camera's frame.
+    unit: length of a unit of the translation, in world units.
 
     By the closed form of `motion` (scene/poses.py) in Murray, Li and Sastry 1994, eq. 2.14 and 2.36, in Python's
     numbers: a call for each step of a training must be quick.
@@ -60,14 +67,19 @@ def moved_pose(pose: np.ndarray, twist: np.ndarray, unit: float) -> np.ndarray:
     return found
 
 
-def twist_gradient(pose: np.ndarray, numbers: np.ndarray, unit: float) -> np.ndarray:
-    """The gradient (6,) of a loss by `moved_pose`'s twist at 0, from that by a camera's numbers.
+def twist_gradient(pose: np.ndarray, gradient: np.ndarray, unit: float) -> np.ndarray:
+    """Turn the gradient of a loss by a camera's numbers into the gradient (6,) by `moved_pose`'s twist at 0.
 
-    numbers: in the order of diff_gaussian_rasterization/camera.py, of which rows and translation of the view, and the
-    centre count. A twist (w, v) changes a column c of the rotation by w x c, the translation t by w x t + v, and the
-    centre by -rotation^T v.
+    Returns the derivatives by the twist's rotation (3, per radian), then by its translation (3, per unit). By the chain
+    rule: a twist (w, v) changes a column c of the rotation by w x c, the translation t by w x t + v, and the centre by
+    -rotation^T v.
+
+    pose: world-to-camera matrix (4, 4) of the camera.
+    gradient: of the loss by the camera's numbers, in the order of diff_gaussian_rasterization/camera.py. The first 15
+        are read: the rotation of `pose` row by row (9), its translation (3), and the camera's centre in the world (3).
+    unit: length of a unit of the twist's translation, in world units.
     """
-    columns, given = pose[:3].T.tolist(), numbers[:15].tolist()
+    columns, given = pose[:3].T.tolist(), gradient[:15].tolist()
     turn, center = [0.0, 0.0, 0.0], given[12:]
     for (x, y, z), (u, v, w) in zip(columns, (given[0:9:3], given[1:9:3], given[2:9:3], given[9:12]), strict=True):
         turn[0] += y * w - z * v
@@ -130,15 +142,20 @@ def _project_fisheye(local: np.ndarray, unit: float) -> tuple[np.ndarray, np.nda
 
 
 def damped(curvature: np.ndarray) -> np.ndarray:
-    """A matrix (6, 6) that has an inverse, even where no point lies before the camera."""
+    """Return a curvature (6, 6) with a little added to its diagonal, so that it has an inverse even without points."""
     return curvature + max(1e-9 * np.trace(curvature), 1e-30) * np.eye(6)
 
 
 def nearest_pose(pose: np.ndarray, photo: PhotoPoints | None, focal: float, unit: float, bound: float) -> np.ndarray:
-    """Find the pose of least reprojection error near a pose.
+    """Find the pose (4, 4) of least reprojection error near a pose, by Gauss-Newton steps.
 
     The pose stays as it is without points, if noise explains the gain by the F statistic of its six numbers (Seber and
     Lee 2003, section 4.2), or if rotation (radians) or translation (units) exceed `bound`.
+
+    pose: world-to-camera matrix (4, 4).
+    photo: 3D points, and their rays in the photo; None: no points.
+    focal: focal length, pixels.
+    unit: length of a unit of translation, in world units.
     """
     if photo is None:
         return pose

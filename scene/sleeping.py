@@ -49,7 +49,7 @@ class Sleeping:
         self.reset()
 
     def reset(self) -> None:
-        """Mark all blocks awake, without missed steps. Call this once all rows have taken the same steps."""
+        """Take note that all rows have taken the same steps: all blocks are awake, and none has missed a step."""
         rows = self._gaussians._xyz
         blocks = -(-len(rows) // BLOCK)
         taken = int(self._gaussians.optimizer.state_of(rows)["step"])
@@ -103,7 +103,10 @@ class Sleeping:
 
     @contextmanager
     def flushed_view(self) -> Iterator[None]:
-        """Let no block have slept while the context lasts; afterwards restore the model to the bit."""
+        """Return a context in which the model is as if no block had ever slept, for others to read.
+
+        All blocks take their missed steps at its begin. At its end the model is restored to the bit.
+        """
         if self._is_whole:
             yield
             return
@@ -118,7 +121,10 @@ class Sleeping:
                 self._asleep = None
 
     def captured(self) -> State | None:
-        """The state of sleep that a checkpoint within `flushed_view` lacks; None: nothing. Every rank must call it."""
+        """Return what a checkpoint that is written within `flushed_view` has to keep of the sleep before it.
+
+        None if no block slept. Every rank must call it.
+        """
         if self._asleep is None:
             return None
         whole = self._gaussians.shards.gather_whole

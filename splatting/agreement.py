@@ -70,7 +70,12 @@ _SIGNALS = (None, KeyboardInterrupt, Terminated)
 
 
 class StepAgreement(Part):
-    """Shares whether an iteration is due, which signal asks to stop, and where the guard has stopped the optimisers.
+    """Shares three facts of an iteration among ranks, so that all ranks act alike.
+
+    - The iteration is due on a rank: somebody there reads or writes the model in it (`Iteration.due`).
+    - A signal, as of Ctrl-C, asks a rank to stop.
+    - The guard of a rank's optimisers (`StepGuard`) has found a loss or step that is not finite, and lets them take no
+      further step.
 
     These facts travel with the numbers that ranks exchange to render the iteration's view (`all_gather_ints`), and are
     known when the losses are. A signal counts on all ranks for the iteration that begins after it, whichever rank has
@@ -80,8 +85,13 @@ class StepAgreement(Part):
     def __init__(self, group: Ranks, interrupt: DeferredInterrupt, guard: StepGuard | None) -> None:
         """Prepare the exchange.
 
-        interrupt: signals of this process.
-        guard: guard of its optimisers, or None.
+        With several ranks, this makes the guard's `stopped` the `flag` of the group. Each exchange then raises it to
+        the largest of all ranks: once the guard of one rank has stopped its optimisers, those of all ranks stop.
+
+        group: the ranks that train together, or one process by itself.
+        interrupt: signals that this process receives.
+        guard: guard of this process's optimisers; None if they have none, as those of other programs. Then nothing
+            about it is shared.
         """
         self._group, self._interrupt = group, interrupt
         if group.several:

@@ -61,7 +61,7 @@ class LossEvents(Part):
         self._kept: list[tuple] = []
 
     def measured(self, at: Iteration, losses: Losses) -> None:
-        """Keep the losses of every tenth iteration, and write the kept ones once an iteration is due."""
+        """Keep the losses of every tenth iteration; write them in an iteration that is due, which waits for the GPU."""
         if at.iteration % INTERVAL == 0 and not at.takes(self._run.launch.test_iterations):
             self._kept.append((at.iteration, losses.l1, losses.total, self._run.clock.seconds - at.started))
         if at.due and self._kept:

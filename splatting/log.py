@@ -37,7 +37,7 @@ class ProgressBar(Part):
         return False  # it reads losses, and not the model, whose blocks may sleep on
 
     def measured(self, at: Iteration, losses: Losses) -> None:
-        """Keep the losses, and show their means in an iteration that is due."""
+        """Keep the losses, and show their means in an iteration that is due, in which the GPU is waited for anyway."""
         for name, term in losses.terms.items():
             self._shown.setdefault(f"{name.capitalize()} Loss", LossWatch()).add(at.iteration, term)
         if not at.due:

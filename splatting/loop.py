@@ -209,9 +209,10 @@ def _step_camera(run: Run, at: Iteration, planes: list[Tensor | None]) -> None:
 
 
 def _prepare_rows(run: Run, at: Iteration) -> None:
-    """Place a trained camera, and wake the blocks that the step concerns.
+    """Place a trained camera, and wake the blocks of rows that the step concerns.
 
-    All blocks wake where rows change, or where no step follows.
+    Blocks that a view does not show sleep: they miss steps, and take these once they wake (scene/sleeping.py). All
+    blocks wake where rows change, or where no step follows.
     """
     if run.camera_steps:
         run.camera_steps.place(at.camera)
@@ -225,7 +226,7 @@ def _prepare_rows(run: Run, at: Iteration) -> None:
 
 
 def _reaches_sleepers(run: Run) -> bool:
-    """Tell whether the loss depends on a row that sleeps, because somebody has added a term to the loss."""
+    """Tell whether a row that sleeps has a gradient, because somebody has added a term to the loss."""
     rows = run.sleeping and run.gaussians.optimizer.rows
     if rows is None:
         return False
@@ -234,7 +235,7 @@ def _reaches_sleepers(run: Run) -> bool:
 
 
 def _stop_skipping(run: Run) -> None:
-    """Wake all blocks for good, and drop the gradients of a step that will be taken again."""
+    """Wake all blocks of rows for good, and drop the gradients of a step that will be taken again."""
     run.gaussians.drop_gradients()
     run.gaussians.optimizer.rows = None
     run.stop_skipping()

@@ -57,7 +57,7 @@ run.sizes    the size of a view in an iteration
 run.pixel_filter  the pixels of a view that count in its loss. It may learn from renders, so no step is taken twice, and
              the host does not run ahead of a GPU.
 run.camera_steps  the optimiser of cameras, by the gradients of their numbers, on the host: `place`, `step`,
-             `independent`
+             `count_independent`
 
 Keep values per row in model.columns, which move with the rows.
 """

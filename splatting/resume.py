@@ -63,7 +63,7 @@ class Resume(Part):
         return at.last and not launch.no_last_checkpoint and not at.takes(launch.checkpoint_iterations)
 
     def stepped(self, at: Iteration) -> None:
-        """Write the checkpoint that is due or the last one, and measure how fast the disk is."""
+        """Write the checkpoint that `due` has announced, the last one or one between, whose writing is timed."""
         if at.stopping:
             return
         if self._leaves_checkpoint(at):

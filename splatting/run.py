@@ -307,7 +307,7 @@ class Run:
         return nullcontext() if self.sleeping is None else self.sleeping.flushed_view()
 
     def stop_skipping(self) -> None:
-        """Let all blocks take the steps that they have missed, and let none sleep from now on."""
+        """Let the blocks of rows that sleep take the steps that they have missed, and let none sleep from now on."""
         if self.sleeping is not None:
             self.sleeping.flush()
         self.sleeping = None

@@ -111,7 +111,7 @@ class Schedule:
         )
 
     def known(self, planned: Sequence[int]) -> list[int]:
-        """Return the run's iterations at which planned iterations of the schedule are due, as far as they are known."""
+        """Return the run's iterations that stand for planned iterations of the schedule, as far as they are known."""
         return [iteration for iteration in planned if iteration <= self.length]
 
 

@@ -29,7 +29,7 @@ _WORSE_AFTER = 100  # iterations after which a loss should have fallen
 
 
 class DivergenceWatch(Part):
-    """Checks, when something is due, that all losses and all steps of the optimisers were finite.
+    """Checks, in iterations that are due (`Iteration.due`), that all losses and steps of optimisers were finite.
 
     The optimisers change nothing after the first one that was not (StepGuard), so that even a late check finds the
     model as it was.

@@ -70,15 +70,15 @@ def _unit(rows: np.ndarray) -> np.ndarray:
 
 
 def test_a_photo_in_a_wrong_place_is_named():
-    found = agreement.verdict([*agreement.pairs_by_tracks(_room())])
+    found = agreement.verdict([*agreement.judge_pairs_by_tracks(_room())])
     assert (found["agreeing"], found["contradicting"], found["against"]) == (COUNT, 0, [])
-    found = agreement.verdict([*agreement.pairs_by_tracks(_room({5: np.array([0.1, -0.1, 0.2])}))])
+    found = agreement.verdict([*agreement.judge_pairs_by_tracks(_room({5: np.array([0.1, -0.1, 0.2])}))])
     assert found["against"] == ["05.jpg"] and found["agreeing"] == COUNT - 1
 
 
 def test_a_part_in_a_wrong_place_is_named_although_it_agrees_with_itself():
     aside = dict.fromkeys(range(8, COUNT), np.array([0.3, 0.2, 0.4]))
-    found = agreement.verdict([*agreement.pairs_by_tracks(_room(aside))])
+    found = agreement.verdict([*agreement.judge_pairs_by_tracks(_room(aside))])
     assert found["against"] == [f"{number:02d}.jpg" for number in range(8, COUNT)] and found["agreeing"] == 8
 
 

@@ -262,13 +262,18 @@ def find_neighbours(photos: Mapping[str, Mapping[str, Any]]) -> dict[str, list[s
 def rate_capture(
     report: Mapping[str, Any], photos: Mapping[str, Mapping[str, Any]], looks: Mapping[str, Look]
 ) -> dict[str, Any]:
-    """Rate a capture, for convert_report.json.
+    """Find the weak photos of a capture, and what to photograph again; return entries for convert_report.json.
 
-    report: the content of that file so far.
-    photos: of capture.json.
-    looks: of all photos, from `compare_brightness`.
-    Returns `weakly_connected` and `blurred`, names of photos; `brightness_spread_stops` of the placed photos, or None;
-    and `again`, a sentence for each thing to photograph again.
+    report: the entries of convert_report.json so far.
+    photos: the entry of each placed photo in capture.json, by name.
+    looks: sharpness and brightness of all photos, from `compare_brightness`.
+
+    Returns a dict:
+
+    weakly_connected: names of placed photos that share points with too few others.
+    blurred: names of photos.
+    brightness_spread_stops: standard deviation of the placed photos' brightness, in stops; None: not known.
+    again: a sentence for each thing to photograph again.
     """
     neighbours = find_neighbours(photos)
     against = {name for found in report.get("tried", [])[:1] for name in found.get("against", ())}

@@ -170,15 +170,20 @@ def _map_gpus(gpus: Sequence[int]) -> list[str]:
     return [given.split(",")[gpu] if given else str(gpu) for gpu in gpus]
 
 
-def _carry_out(
+def _complete_runs(
     runs: Sequence[Run], args: Namespace, gpus: Sequence[str], failures: dict[Run, Failure], start: Start
 ) -> None:
-    """Carry out every run; note and print a failure, and continue with the next run."""
+    """Train, render and score every run, without the stages that options skip; a failed run does not stop the others.
+
+    gpus: values of CUDA_VISIBLE_DEVICES, among which the runs are shared; empty: one run after the other.
+    failures: receives the failure of each run that fails, which is printed, too.
+    start: runs the command of a stage.
+    """
     facts = {} if args.skip_training else facts_from_process()
     options = _SHORT_FOR["aa"][0] if args.aa else ()
     download = True
 
-    def carry_out(numbered: tuple[int, Run], slot: Slot | None = None) -> None:
+    def complete(numbered: tuple[int, Run], slot: Slot | None = None) -> None:
         """Train, render and score one run, and print how it ended.
 
         numbered: its number from 1 on, and the run.
@@ -205,10 +210,10 @@ def _carry_out(
         _print_line(f"{head}: {end}" if slot else f"  {end}")
 
     if gpus:
-        share_gpus(enumerate(runs, 1), gpus, carry_out)
+        share_gpus(enumerate(runs, 1), gpus, complete)
     else:
         for numbered in enumerate(runs, 1):
-            carry_out(numbered)
+            complete(numbered)
 
 
 def _print_line(line: str) -> None:
@@ -264,7 +269,7 @@ def main(argv: Sequence[str] | None = None, start: Start = run_child) -> None:
     busy = "full_eval.py (process {process}), or a training that it started,"
     with locked(output, "full_eval.py", busy, "--output_path", inherited=True):
         try:
-            _carry_out(runs, args, gpus, failures, start)
+            _complete_runs(runs, args, gpus, failures, start)
         finally:  # report the finished runs after Ctrl-C too
             scored = _write_report(["full_eval.py", *words], runs, failures, peers, output)
     if failures:

@@ -103,8 +103,9 @@ def _describe_seeds(runs: Sequence[dict[str, Any]], subset: int | None) -> str:
 
 
 def draw_sizes(folder: Path, scene: str, runs: Sequence[dict[str, Any]]) -> list[Path]:
-    """Draw test PSNR against the number of Gaussians trained; return the file, none where the number is the same.
+    """Draw the test PSNR of a scene's runs against their numbers of Gaussians; return a list with the file.
 
+    The list is empty, and nothing is drawn, with one option set only, or if all numbers are nearly the same (SAME).
     Option sets whose names differ only in a number at the end, as adc-100k and adc-1M, are joined by a line for each
     seed.
     """

@@ -16,7 +16,7 @@ from applications.viewer.coverage import Coverage, darken_guesses
 from applications.viewer.legend import ERROR_SCALE, Legend, color_counts, color_depth, draw_error
 from applications.viewer.views import Pose, SceneCameras, Settings, Vector, fit_canvas
 from gaussian_renderer import render
-from gaussian_renderer.blending import blend_depth, view_planes
+from gaussian_renderer.blending import count_list_entries, view_planes
 from gaussian_renderer.free_view import free_view, rotation_matrix
 from gaussian_renderer.median_depth import median_at
 from groundwork.files.image_files import dim_masked, to_bytes
@@ -117,7 +117,7 @@ class Frames:
         """The mode's image (3, H, W) in [0, 1]. Without a target there is no error, and the colour is drawn."""
         part = select_shown(self.gaussians, settings, self.kept)
         if settings.mode == views.COUNT:
-            return color_counts(blend_depth(view, part, self._pipe, settings.scaling))
+            return color_counts(count_list_entries(view, part, self._pipe, settings.scaling))
         if settings.mode in (views.DEPTH, views.OPACITY):
             planes = view_planes(view, part, self._pipe, settings.scaling)
             if settings.mode == views.DEPTH:

@@ -1,4 +1,8 @@
-"""A rank's band of a view: forward to the image, and backward to the gradient rows of the rank's Gaussians."""
+"""A rank's band of a view: forward to the image, and backward to the gradient rows of the rank's Gaussians.
+
+A band is a range of rows of tiles of the image, which one rank blends. Each rank also has a part of the Gaussians. It
+projects these, sends the splats to the bands that they reach, and gets back the rows of their gradients.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,10 +19,10 @@ from groundwork.ranks.ranks import Ranks
 
 
 class Band(NamedTuple):
-    """The rows of a band, and a sum over ranks, for a loss by bands (`photometric_loss_by_bands` of fused_ssim)."""
+    """The band of a rank as a loss by bands takes it (`photometric_loss_by_bands` of fused_ssim)."""
 
-    rows: tuple[int, int]  # of pixels, first and end
-    add: Callable[[Tensor], Tensor]  # sums over all bands
+    rows: tuple[int, int]  # of pixels: the first one, and the one behind the last
+    add: Callable[[Tensor], Tensor]  # sums a tensor over the bands of all ranks
 
 
 @dataclass(slots=True)
@@ -30,11 +34,11 @@ class View:
     color: Tensor  # (3, H, W), right in the rows of the band, unless `gather_image` or `exchange_halo` says more
     inverse_depth: Tensor  # (1, H, W), or no rows if it is not wanted
     radii: Tensor  # (N,) of the rank's own Gaussians
-    splats: Tensor  # (N, 10)
-    tile_counts: Tensor  # (N,)
-    sent: Sent
-    inside: Tensor  # (n,) bool of what was received: whether it reaches no other band
-    drawing: Drawing  # of the band
+    splats: Tensor  # (N, 10), of the rank's own Gaussians
+    tile_counts: Tensor  # (N,), of the rank's own Gaussians
+    sent: Sent  # the records of Gaussians that the rank has sent to bands, for the way back
+    inside: Tensor  # (n,) bool, the received records that reach no other band
+    drawing: Drawing  # the band with the received splats
     background: Tensor
 
     @property
@@ -58,9 +62,16 @@ def draw_view(
 ) -> View:
     """Render the rank's band of a view with the Gaussians of all ranks, to the same bits as one process.
 
+    Every rank must call it. Returns the band in an image of full size: other rows are right only after `gather_image`
+    or `exchange_halo`.
+
     scene: the rasterizer's arguments with the rank's own Gaussians.
-    find: takes the place of `find_bands`.
-    awake: which of the rank's own blocks are awake (scene/sleeping.py), None: all.
+    background: (3,).
+    want_depth: true to blend the inverse depth, too.
+    train: true if a backward follows, for which the lists and layers are kept.
+    find: function that chooses the bands, in place of `find_bands` and with its arguments, such as `CachedBands.find`.
+    awake: (blocks,) uint8, 0 for blocks of the rank's rows that sleep: the view does not show them, so they are not
+        projected (scene/sleeping.py). None: all are awake.
     """
     height, width = scene.size
     own, depths, rects, tile_counts, radii = OPERATORS.project(*scene, awake)
@@ -102,7 +113,9 @@ def exchange_halo(view: View) -> View:
 def gradient_rows(
     view: View, gradients: tuple[Tensor, Tensor | None, Tensor | None], absolute: bool
 ) -> tuple[Tensor, Tensor]:
-    """Compute gradient rows of the rank's own Gaussians, and their number for each, from gradients of the image.
+    """Compute gradient rows of the rank's own Gaussians from gradients of the image, and return them to their ranks.
+
+    Returns the rows, those of a Gaussian one after the other, and their number for each Gaussian (N,) (`return_rows`).
 
     gradients: of colour, transmittance and inverse depth, (., H, W); only the rows of the band are read.
     """
@@ -113,12 +126,13 @@ def gradient_rows(
 def camera_gradient(
     ranks: Ranks, scene: Scene, source: Sequence[Tensor], absolute: bool = False, blocks: Sequence[int] | None = None
 ) -> Tensor:
-    """Gradients of the camera's numbers (diff_gaussian_rasterization/camera.py) by the Gaussians of all ranks, float64.
+    """Return the gradient of the loss by the camera's numbers, (numbers,) float64, over the Gaussians of all ranks.
 
-    If each rank has whole blocks of rows (Shards), the bits are those of one process. Every rank must call it.
+    The numbers are in the order of diff_gaussian_rasterization/camera.py. If each rank has whole blocks of rows
+    (Shards), the bits are those of one process. Every rank must call it.
 
     source: splats, tile counts, and the result of `gradient_rows`.
-    blocks: number of blocks of each rank, if known.
+    blocks: number of blocks of rows that each rank has (groundwork/ranks/rows.py); None: not known.
     """
     own = OPERATORS.camera_vjp(*scene, source, absolute)
     return OPERATORS.sum_blocks(ranks.all_gather_rows(own, blocks))

@@ -1,4 +1,4 @@
-"""The division of an image's rows of tiles into bands, one for each rank."""
+"""The division of an image's rows of tiles into bands, one for each rank, which blends it."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass

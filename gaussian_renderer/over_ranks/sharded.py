@@ -53,7 +53,13 @@ def draw_divided(
     camera: Camera | MiniCam,
     awake: Tensor | None = None,
 ) -> "DividedDrawn | None":
-    """Do as `draw` of the renderer for a model that is divided among ranks; None for a whole model."""
+    """Draw a view as `draw` of the renderer does, for a model that is divided among ranks; None for a whole model.
+
+    by_bands: true if each rank needs only its own band of the image, and the rows around it that a loss reads; false:
+        every rank gets the whole image.
+    bands: the divisions of views into bands that earlier visits found; None: they are found anew.
+    awake: (blocks,) uint8, 0 for blocks of the rank's rows that sleep (scene/sleeping.py); None: all are awake.
+    """
     if not (ranks := _find_ranks(model)).several:
         return None
     find = bands and partial(bands.find, camera.uid)
@@ -65,9 +71,9 @@ def draw_divided(
 
 
 class DividedDrawn:
-    """`Drawn` for a divided model. band: the rows of the image that are valid; None: all.
+    """A view of a divided model with its gradients, in place of `Drawn` of a whole model.
 
-    The image's gradient is read in the valid rows only.
+    band: rows of the image that are valid, and whose gradient is read: the band of this rank; None: all rows.
     """
 
     def __init__(
@@ -75,8 +81,9 @@ class DividedDrawn:
     ) -> None:
         """Keep a drawn view of a divided model, and what its gradients need.
 
-        by_bands: this process has the loss of its own band of the image only. awake: blocks of Gaussians that take
-        part.
+        by_bands: true if this process has the loss of its own band of the image only.
+        awake: (blocks,) uint8, 0 for blocks of the rank's rows that sleep and take no step; None: all are awake.
+        blocks: number of blocks of rows that each rank has.
         """
         self.image, self.depth, self.radii = view.color, view.inverse_depth if want_depth else None, view.radii
         self.band = view.band if by_bands else None

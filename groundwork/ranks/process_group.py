@@ -12,7 +12,7 @@ from groundwork.ranks.ranks import Ranks, Value
 
 # Into one tensor. The older name warns where there is a newer one.
 ALL_GATHER = "all_gather_single" if hasattr(dist, "all_gather_single") else "all_gather_into_tensor"
-_NEWS = 2  # numbers that are posted
+_NEWS = 2  # numbers that `piggyback` leaves
 # Of a collective call, after which a rank that does not come to it is taken for hung. No work of one rank that the
 # others wait for may take longer, as rank 0 writing a checkpoint.
 TIMEOUT = timedelta(minutes=2)
@@ -22,6 +22,10 @@ class SeveralRanks(Ranks):
     """The ranks of the default process group.
 
     Numbers and objects of the host use a gloo group. Tensors use NCCL if the group has it, else copies on the CPU.
+
+    Some numbers are in no hurry, and travel along with `all_gather_ints` in place of a message of their own: the `flag`
+    of each rank, a tensor that the call raises to the largest of all ranks; and two numbers that a rank leaves by
+    `piggyback`, whose maxima over all ranks `latest` returns.
     """
 
     def __init__(self) -> None:
@@ -30,8 +34,9 @@ class SeveralRanks(Ranks):
         by_gpu = dist.get_backend() == "nccl"
         self._place = "cuda" if by_gpu else "cpu"  # of what the default group sends
         self._numbers = dist.new_group(backend="gloo", timeout=TIMEOUT) if by_gpu else dist.group.WORLD
-        self._silence = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)
-        self._piggybacked, self._latest = [0] * _NEWS, [0] * _NEWS
+        self._zeros = torch.zeros(_NEWS, dtype=torch.int64, device=self._place)  # what a rank sends that has no news
+        self._piggybacked = [0] * _NEWS  # this rank's
+        self._latest = [0] * _NEWS  # maxima over ranks; None until those of the last `piggyback` have travelled
 
     def leave(self) -> None:
         """Leave the group and end its threads: a thread that is left at Python's exit aborts the process."""
@@ -69,13 +74,15 @@ class SeveralRanks(Ranks):
         return box
 
     def all_gather_ints(self, numbers: Tensor, meanwhile: Callable[[], None] = lambda: None) -> list[list[int]]:
-        """Gather the numbers (K,) int64 of all ranks: a row for each rank.
+        """Gather integers of all ranks: a list for each rank, in the order of ranks.
 
-        meanwhile: is called while they travel. The ranks' flags and piggybacked numbers travel along, to save a
-        message.
+        Flag and piggybacked numbers of all ranks are exchanged, too. The call sets `flag`, and what `latest` returns.
+
+        numbers: (n,) int64 of this rank, as many on each rank.
+        meanwhile: called while the numbers travel.
         """
-        news = torch.tensor(self._piggybacked, device=self._place) if any(self._piggybacked) else self._silence
-        flag = self._silence[:1] if self.flag is None else self.flag.to(self._place)
+        news = torch.tensor(self._piggybacked, device=self._place) if any(self._piggybacked) else self._zeros
+        flag = self._zeros[:1] if self.flag is None else self.flag.to(self._place)
         found = read_later(self._all_gather(torch.cat((numbers.to(self._place), flag, news))))
         meanwhile()
         found = found()
@@ -91,7 +98,7 @@ class SeveralRanks(Ranks):
 
     def latest(self) -> Sequence[int]:
         if self._latest is None:
-            self.all_gather_ints(self._silence[:0])
+            self.all_gather_ints(self._zeros[:0])
         return self._latest
 
     def all_gather(self, values: Tensor) -> Tensor:

@@ -27,11 +27,13 @@ class Ranks:
 
     rank: number of this process, from 0.
     size: number of ranks.
+    flag: (1,) int64, which each `all_gather_ints` overwrites with the largest of all ranks, if that is larger; the
+        owner of the tensor reads there what another rank has set. None on all ranks: no flag.
     """
 
     rank = 0
     size = 1
-    flag: Tensor | None = None  # (1,) int64, which each `all_gather_ints` raises to the largest of all ranks
+    flag: Tensor | None = None
 
     @property
     def several(self) -> bool:
@@ -77,11 +79,11 @@ class Ranks:
         return [found()]
 
     def piggyback(self, *news: int) -> None:
-        """Leave two integers, 0 or more, for the next `all_gather_ints` to exchange."""
+        """Leave two integers, 0 or more, that the next `all_gather_ints` sends along to save a message."""
         self._piggybacked = news
 
     def latest(self) -> Sequence[int]:
-        """Return the maximum over ranks of each of the two numbers of the last `piggyback`."""
+        """Return the maximum over ranks of each number of the last `piggyback`; exchange them first if need be."""
         return self._piggybacked
 
     def all_gather(self, values: Tensor) -> Tensor:

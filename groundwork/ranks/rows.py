@@ -1,4 +1,7 @@
-"""The division of a model's rows among ranks, and their redistribution after a change."""
+"""The division of a model's rows among ranks, and their redistribution after a change.
+
+A block is BLOCK consecutive rows. Each rank has whole blocks, except the last one of all.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -119,7 +122,7 @@ class Shards:
         return rows
 
     def changing(self, gaussians: Any) -> AbstractContextManager[None]:
-        """Divide the rows again at the end of the block, which changes them; a nested call does nothing."""
+        """Return a context within which rows may change; its end divides them again. A nested call does nothing."""
         return nullcontext()
 
     def match_steps(self, optimizer: torch.optim.Optimizer | None) -> None:
@@ -272,7 +275,11 @@ WHOLE = Shards()
 
 
 def bound(rank: int, total: int, size: int) -> int:
-    """The index of a rank's first row when all rows are divided evenly by blocks."""
+    """Return the index of a rank's first row where whole blocks of rows are divided evenly; of rank `size`, the total.
+
+    total: number of all rows.
+    size: number of ranks.
+    """
     return min(rank * -(-total // BLOCK) // size * BLOCK, total)
 
 

@@ -108,10 +108,10 @@ def check_agreement(folder: Path) -> Iterator[Finding]:
     """Find photos of a COLMAP model whose tracks contradict each other, as if a part of it is in a wrong place."""
     import pycolmap
 
-    from scene.agreement import FLOOR, pairs_by_tracks, verdict
+    from scene.agreement import FLOOR, judge_pairs_by_tracks, verdict
 
     try:
-        pairs = list(pairs_by_tracks(pycolmap.Reconstruction(str(folder))))
+        pairs = list(judge_pairs_by_tracks(pycolmap.Reconstruction(str(folder))))
     except (ValueError, RuntimeError, IndexError, OSError):
         return  # no model of COLMAP's; the readers have said what is wrong with one
     if not pairs:

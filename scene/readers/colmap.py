@@ -109,7 +109,14 @@ def _read_pose(photo: Image) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_own_cloud(folder: Path, model_folder: Path, model: ColmapModel) -> StartCloud | None:
-    """Read the start cloud of a COLMAP model: its PLY if that is not older than the points, else its points."""
+    """Read the points of a COLMAP model, from which a training starts; None if the model has no file of points.
+
+    The model's PLY is used in place of its points if it is not older; an older PLY is named in a message. UserError
+    if there are no points, and convert.py has left its verdict on the model.
+
+    folder: folder of the scene.
+    model_folder: folder of the model's files.
+    """
     source, ply = _find_file(model_folder, _POINTS, "bin"), model_folder / f"{_POINTS}.ply"
     if ply.is_file():
         if source is None or not len(model.points.ids) or ply.stat().st_mtime >= source.stat().st_mtime:

@@ -239,8 +239,12 @@ def _read_pair(pair: Pair) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
 
 
 def _score_unfitted(whole: list[Pair], fitted: list[Pair], scored: Container[str]) -> dict[str, float | None]:
-    """Return the PSNR of whole views in the right halves that the fitted views show, by file name.
+    """Return the PSNR of the right halves of views, without the appearance that was fitted to the left halves.
 
+    Returns it by file name, for comparison with the scores of the fitted halves.
+
+    whole: pairs of whole pictures, as the model renders them.
+    fitted: pairs of the same views, of which only the right halves are shown, with fitted appearance.
     scored: file names of the views that are scored.
     """
     found, widths = {}, {pair.name: pair.size[0] for pair in fitted if pair.name in scored}

@@ -35,7 +35,13 @@ class CapturedStep(FusedStep):
         self._fetched: dict[int, _Fetched] = {}  # by iteration: of cameras that have yet to step
 
     def take(self, at: Iteration, tell: Tell) -> bool:
-        """Queue a step, unless something is due in it."""
+        """Queue a step on the GPU, and do not wait for it. Return False for a step that `plain_step` must take.
+
+        A step is taken as `FusedStep` does, after all pending ones, in an iteration that is due: in it the model is
+        read, written or changed (`Iteration.due`).
+
+        tell: receives the losses. The GPU may have yet to compute those of a step that was queued.
+        """
         run = self._run
         if not self._is_queued(at):
             self.drain()  # nothing is pending, unless --debug_from has just come into force
@@ -52,14 +58,14 @@ class CapturedStep(FusedStep):
         return True
 
     def throttle(self, at: Iteration) -> None:
-        """Wait until this step may be queued; wait for all pending steps if it cannot be queued.
+        """Wait until fewer than AHEAD steps are pending; until none is, if this step cannot be queued.
 
         Where cameras are trained, first take those of their pending steps that change this view's pose.
         """
         if self._is_queued(at):
             self._ahead.throttle()
             if host := self._run.camera_steps:
-                most = host.independent(at.camera.uid, [one.uid for one in self._fetched.values()])
+                most = host.count_independent(at.camera.uid, [one.uid for one in self._fetched.values()])
                 self._ahead.wait(most)
                 self._step_on_host(min(most, AHEAD))
         else:
@@ -76,6 +82,7 @@ class CapturedStep(FusedStep):
         self._ahead.abort()
 
     def _is_queued(self, at: Iteration) -> bool:
+        """Tell whether the step is queued: there is one, nobody reads or changes the model, and it can be fused."""
         return at.steps and not at.due and self._fuses(at)
 
     def _knows_model(self) -> bool:
@@ -145,12 +152,14 @@ class CapturedStep(FusedStep):
         """Take back the counts of the host for steps that will be replayed."""
         self._run.gaussians.rewind(steps)
         if steps and self._run.sleeping:
-            self._run.sleeping.stepped()  # a rest may be among the steps
+            self._run.sleeping.stepped()  # one that woke all blocks (REST of scene/sleeping.py) may be among the steps
         self._graphs.clear()
 
 
 @dataclass
 class _Fetched:
-    uid: int
+    """The gradient of a camera, on its way to the host, where the camera's step is pending."""
+
+    uid: int  # of the camera
     gradient: Tensor  # (CAMERA_NUMBERS,) on the host, once it is copied
-    copied: torch.cuda.Event | None
+    copied: torch.cuda.Event | None  # the end of the copy; None if it was made at once

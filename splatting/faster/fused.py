@@ -97,8 +97,8 @@ class FusedStep(FasterSteps):
         """Tell whether the loss of the last `measure` depends on a parameter otherwise than by the image.
 
         This is so if somebody has added a term to the loss. The gradients of that term are dropped, and from now on all
-        steps are plain. Blocks go on sleeping until a plain step finds that the term reaches them: to wake them here
-        would lose a rest if a step has halted.
+        steps are plain. Blocks of rows go on sleeping until a plain step finds that the term reaches them: to wake them
+        here would lose the wake-up of all blocks (REST of scene/sleeping.py) if a step has halted.
         """
         gaussians = self._run.gaussians
         params = [gaussians.raw(name) for name in gaussians._attributes]
@@ -119,7 +119,7 @@ class FusedStep(FasterSteps):
             drawn.step(adam, *gradients, observes, self.absolute_gradients, camera=self.camera_gradient)
 
     def follow(self, at: Iteration) -> None:
-        """Change rows, where that is due, and take the step of the exposures."""
+        """Let the strategy change rows, if the iteration may change any, and take the step of the exposures."""
         run = self._run
         if at.changes:
             run.strategy.change_rows(at)

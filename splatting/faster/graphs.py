@@ -100,7 +100,7 @@ class Graphs:
         self._graphs.clear()
 
     def check(self) -> None:
-        """Forget the graphs if something has changed that they took for fixed."""
+        """Forget the graphs if tensors or options have changed whose addresses or values they have recorded."""
         run, optimizer = self._run, self._run.gaussians.optimizer
         columns = optimizer.active_columns("f_rest")
         used = run.objective, run.strategy, run.pipe.antialiasing, type(optimizer), optimizer.guard, columns

@@ -44,7 +44,10 @@ class Adc(Strategy):
         self.max_gaussians = opt.max_num_splats
 
     def actions(self, iteration: int) -> Actions:
-        """Return what is due. A run by the clock leaves resets out from which it is too short to recover."""
+        """Return what density control does in an iteration.
+
+        A run by the clock leaves out resets of opacities from which it is too short to recover.
+        """
         opt, schedule = self._opt, self.schedule
         span, stride, resets = schedule.span(iteration), schedule.stride(iteration), opt.opacity_reset_interval
         todo, now = rules.actions(iteration, opt, self._white_background, span, stride), span.stop - 1

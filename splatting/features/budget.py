@@ -67,7 +67,7 @@ class Budget(Strategy):
         return Rates(factor, band_rate(self._cameras), 1.0 - min(SQUARES * math.sqrt(stride), 1 / LEAST_AVERAGED))
 
     def actions(self, iteration: int) -> Actions:
-        """Return what is due: useless Gaussians are removed before the window's start, too."""
+        """Return what density control does in an iteration: useless Gaussians are removed before the window, too."""
         due = self.window.is_due(iteration, self.schedule.schedule_step(iteration), self.schedule.stride(iteration))
         return Actions(changes=due, densify=due)
 

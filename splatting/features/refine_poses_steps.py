@@ -85,10 +85,14 @@ class PoseRefinement:
         pose = self._pose(view)
         camera.place(pose[:3, :3].T.copy(), pose[:3, 3].copy())
 
-    def independent(self, uid: int, pending: Sequence[int]) -> int:
-        """Return how many of the last pending steps have no effect on a camera's next pose.
+    def count_independent(self, uid: int, pending: Sequence[int]) -> int:
+        """Count the pending steps, from the last one backwards, that have no effect on the pose of a camera.
 
-        pending: cameras of the steps to come.
+        A view can be rendered before these steps are taken, so that the host need not wait for their gradients. A
+        camera's pose depends on its own steps, and on the step that takes out the drift of all cameras.
+
+        uid: number of the camera that will be rendered.
+        pending: numbers of the cameras whose steps are yet to be taken, in order.
         """
         taken, most, period = int(self._counts.sum()), len(pending), _PASSES * len(self.twists)
         if (taken + len(pending)) // period > taken // period:

@@ -170,7 +170,7 @@ class _Photo(NamedTuple):
 
     colors: (h, w, 3).
     counts: cells that count, (h, w) bool.
-    near: cells near points, (2, h, w) bool.
+    near: cells near points, (2, h, w) bool, by a smaller and a larger distance (`_find_near_points`).
     smooth: cells that are smooth, (h, w) bool.
     """
 
@@ -185,7 +185,7 @@ class _Seen(NamedTuple):
     """The sight of all photos at places (N,).
 
     photos: number of photos that show the place, (N,).
-    taken: number of these with a point near by, (2, N).
+    taken: number of these with a point near by, (2, N), by a smaller and a larger distance (`_find_near_points`).
     smooth: number of these that are smooth there, (N,).
     colors: mean colour, (N, 3).
     squares: mean squared difference of the colours from their mean, on the mean of the channels, (N,).
@@ -287,7 +287,14 @@ def _read_cells(camera: Camera, view: CameraInfo, points: np.ndarray) -> _Photo:
 
 
 def _find_near_points(view: CameraInfo, points: np.ndarray) -> np.ndarray:
-    """Return the cells of a photo with a point near by, as near as _AROUND and _SPACINGS say, (2, h, w) bool."""
+    """Return the cells of a photo that have a point near by: (2, h, w) bool, a layer for each of two distances.
+
+    Layer 0, by the smaller distance: cells that do not show the sky. Layer 1, by the larger one: cells that are no
+    evidence of a sky, and do not count in its share. Each distance is a number of cells (_AROUND) or, if that is more,
+    of mean distances of the photo's points (_SPACINGS). All is true for a photo that shows no point: it proves no sky.
+
+    points: (P, 3), in the world.
+    """
     cells = np.zeros((max(view.height * ACROSS // view.width, 1), ACROSS), dtype=bool)
     x, y, inside = projected(view, points.astype(np.float64))
     if not inside.any():

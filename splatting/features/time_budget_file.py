@@ -164,7 +164,14 @@ def _check_fit(found: Decided, path: Path | str, opt: argparse.Namespace) -> Dec
 
 
 def _resume_schedule(before: Any, checkpoint: str, opt: argparse.Namespace, first_iteration: int) -> Decided:
-    """Return the schedule so far of the runs that are resumed; one block if their checkpoint has no schedule."""
+    """Return the decisions of the runs that are resumed, up to the checkpoint's iteration.
+
+    A checkpoint without a schedule is of a run without a time budget, whose iterations were those of the schedule: it
+    stands for one block of them.
+
+    before: the schedule as the checkpoint keeps it, or None.
+    first_iteration: iteration of the checkpoint.
+    """
     if before is None:
         over = first_iteration if first_iteration >= opt.iterations else None
         if not over:

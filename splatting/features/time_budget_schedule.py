@@ -1,4 +1,9 @@
-"""Schedules that a run goes through in fewer or more iterations than they have: by the clock, or as an earlier run."""
+"""Schedules that a run goes through in fewer or more iterations than they have: by the clock, or as an earlier run.
+
+A block is a number of consecutive iterations, each of which does the same part of the schedule. A run by the clock
+(`TimeBudget`) decides one block after the other, from the speed of the blocks before. The decisions are recorded
+(`Decided`), and a `DecidedSchedule` repeats them without a clock, so that the same iterations do the same again.
+"""
 
 import math
 import statistics
@@ -64,12 +69,21 @@ class Decided(NamedTuple):
 
 
 class DecidedSchedule(Schedule):
-    """A schedule that an earlier run has decided.
+    """Repeats the schedule that an earlier run has decided. It reads no clock: each iteration does what it did then.
 
-    sizes: name of `levels`, by which views are smaller at first.
-    megapixels: size of a view.
-    short: SHORT of the device.
-    an_iteration: Gaussians for each iteration that fits into the time.
+    Attributes besides those of `Schedule`:
+
+    blocks: the blocks in order. No iteration behind the last block may be asked for.
+    levels: parts of the schedule, and the factors by which views are smaller from there on.
+    sizes: name of `levels` in files and options.
+    begun: seconds of training before those that the budget counts; None: not decided.
+
+    The part TimeBudget sets the next four when the run begins (splatting/features/time_budget.py):
+
+    megapixels: size of a training view on average.
+    short: megapixels of the whole schedule for each iteration of the run, from which on a run by the clock begins with
+        smaller views; it is SHORT of the device.
+    an_iteration: largest number of Gaussians for each iteration that fits into the time.
     random: true if the model began as random points, of which those may be removed that the run cannot train.
     """
 
@@ -82,14 +96,17 @@ class DecidedSchedule(Schedule):
     _told = False
 
     def __init__(self, decided: Decided) -> None:
-        """Follow decisions of an earlier run, from the first block on."""
+        """Follow recorded decisions from the first block on.
+
+        decided: decisions of an earlier run, from schedule.json or a checkpoint.
+        """
         super().__init__(decided.iterations)
         self._decided = decided
         self.blocks = list(decided.blocks)
         self.ends = decided.ended
         self.sizes, self.levels, self.strategy = decided.sizes, decided.levels, decided.strategy
         self.seconds, self.begun = decided.time_budget, decided.begun
-        self._rests = {one.after for one in decided.continued}
+        self._rests = {one.after for one in decided.continued}  # iterations without a step: there a run was over
 
     def progress(self, iteration: int) -> float:
         """Return the part of the schedule that is done after an iteration, 0 to 1."""
@@ -181,22 +198,23 @@ class DecidedSchedule(Schedule):
 
     @property
     def decided(self) -> Decided:
-        """All that is decided by now, also about iterations to come."""
+        """All decisions up to now, for a record; the last block may reach beyond the present iteration."""
         decided = {"sizes": self.sizes, "levels": self.levels, "strategy": self.strategy, "begun": self.begun}
         return self._decided._replace(blocks=self.blocks, ended=self.ends, **decided)
 
     def up_to(self, iteration: int) -> Decided:
-        """Return the schedule of a run that went no further than an iteration."""
+        """Return the decisions as of a run that went no further than an iteration, for the files written there."""
         index, block = self._find_block(iteration)
         blocks = [*self.blocks[:index], block._replace(last=iteration)]
         return self.decided._replace(blocks=blocks, ended=iteration if self.is_last(iteration) else None)
 
     def _find_block(self, iteration: int) -> tuple[int, Block]:
+        """Return the index of the block to which an iteration belongs, and the block."""
         index = bisect_left(self.blocks, iteration, key=lambda block: block.last)
         return index, self.blocks[index]
 
     def _end_before(self, index: int) -> int:
-        """Return the last iteration before a block."""
+        """Return the last iteration before the block of an index, 0 for the first block."""
         return self.blocks[index - 1].last if index else 0
 
 
@@ -289,7 +307,10 @@ class TimeBudget(DecidedSchedule):
             self.levels = ((now, begun), *(level for level in PYRAMID if level[0] > now))
 
     def _add_block(self, seconds: float) -> None:
-        """Add the next block."""
+        """Add the next block: choose its number of iterations, and the part of the schedule that each does.
+
+        seconds: seconds of training before the block.
+        """
         before = self.blocks[-1].last if self.blocks else 0
         done = AGAIN if self.rests(before) else self.progress(before)
         iterations = self._count_left(seconds - self.begun, (1.0 - done) / (1.0 - AGAIN if self._rests else 1.0))

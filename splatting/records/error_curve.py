@@ -1,4 +1,8 @@
-"""Curves, error against time: error_vs_time.csv of a training, and the CSV files of other programs (`--peer`)."""
+"""Curves, error against time: error_vs_time.csv of a training, and the CSV files of other programs (`--peer`).
+
+A training may score a subset of each set of views at most points, to save time. A subset is named by its number of
+views, and None stands for whole sets.
+"""
 
 import contextlib
 import csv
@@ -128,7 +132,10 @@ def continue_curve(
 
 
 def rows_on(rows: Iterable[Row], subset: float | None) -> list[Row]:
-    """Return the rows that score a subset, None: whole sets. Only rows on the same views compare."""
+    """Return the rows that score a subset of the views. Only rows on the same views compare.
+
+    subset: its number of views; None: whole sets.
+    """
     return [row for row in rows if row.get(SUBSET) == subset]
 
 
@@ -138,9 +145,10 @@ def whole_sets(rows: Iterable[Row]) -> list[Row]:
 
 
 def common_subset(curves: Iterable[Iterable[Row]]) -> int | None:
-    """Return the subset on which curves compare: the one with the most points of those that all curves have.
+    """Return the subset of the test views on which curves compare: its number of views; None: all test views.
 
-    None means whole sets. The curve with the fewest points decides. Curves without test PSNR do not take part.
+    It is a subset that every curve has scored. Among several, the one whose shortest curve has the most points; among
+    equals, all test views. Curves without test PSNR do not take part. None, too, if no subset is common to all curves.
     """
     found = [Counter(row.get(SUBSET) for row in curve if row["test_psnr"] is not None) for curve in curves]
     counts = [count for count in found if count]

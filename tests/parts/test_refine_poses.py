@@ -309,12 +309,12 @@ def test_a_pose_depends_on_its_own_steps_and_on_whole_passes(tmp_path):
     make_colmap_scene(tmp_path)
     _, poses = _refinement(tmp_path)
     count = len(poses.twists)
-    assert poses.independent(2, [0, 1]) == 2 and poses.independent(1, [0, 1, 1, 0, 2]) == 2
+    assert poses.count_independent(2, [0, 1]) == 2 and poses.count_independent(1, [0, 1, 1, 0, 2]) == 2
     whole = [0] * (refinement._PASSES * count)
-    assert poses.independent(2, whole) == 0 and poses.independent(2, [*whole, 0, 1]) == 2
-    assert poses.independent(2, whole[1:]) == len(whole) - 1
+    assert poses.count_independent(2, whole) == 0 and poses.count_independent(2, [*whole, 0, 1]) == 2
+    assert poses.count_independent(2, whole[1:]) == len(whole) - 1
     poses.step(0, np.zeros(34), 0)
-    assert poses.independent(2, whole[1:]) == 0 and poses.independent(0, [*whole, 0, 1]) == 1
+    assert poses.count_independent(2, whole[1:]) == 0 and poses.count_independent(0, [*whole, 0, 1]) == 1
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,7 @@ from applications.viewer.views import Pose, SceneCameras, Settings, fit_canvas, 
 from applications.viewer.watchers import MOVING, STILL, STILL_AFTER, Budget, Watchers
 from arguments import ModelParams
 from gaussian_renderer import render
-from gaussian_renderer.blending import blend_depth
+from gaussian_renderer.blending import count_list_entries
 from gaussian_renderer.camera_paths.keyframes import read_camera_path
 from gaussian_renderer.camera_paths.poses import poses_of
 from gaussian_renderer.camera_paths.start import best_start
@@ -101,11 +101,11 @@ def test_modes_show_what_they_say(gaussians):
     np.testing.assert_array_equal(drawn(gaussians, mode=views.ERROR), rendered(gaussians))
     # The count of a pixel is that of its tile's list up to the last one blended.
     view = free_view(96, 64, FRONT.fov, FRONT.position, FRONT.wxyz, "cpu")
-    counts = blend_depth(view, gaussians, pipeline())
+    counts = count_list_entries(view, gaussians, pipeline())
     with torch.no_grad():
         alpha = render(view, gaussians, pipeline(), BLACK, override_color=torch.ones(200, 3))["render"][0]
     assert torch.equal(counts > 0, alpha > 0) and 0 < counts.max() <= 200
-    assert blend_depth(view, model(1), pipeline()).max() == 1
+    assert count_list_entries(view, model(1), pipeline()).max() == 1
 
 
 def test_a_scale_names_the_depths_and_counts_of_its_colours(gaussians):

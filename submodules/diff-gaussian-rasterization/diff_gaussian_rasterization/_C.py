@@ -145,7 +145,11 @@ def adamUpdate(
     N: int,
     M: int,
 ) -> None:
-    """Takes one step of sparse Adam in place, see `optim.sparse_adam_`. N rows of M values each are not read."""
+    """Takes one step of Adam in place, for the rows that are visible (`optim.sparse_adam_`).
+
+    visibility: (rows,) bool.
+    N, M: number of rows, and of values in a row. They are ignored, because the tensors' shapes tell them.
+    """
     sparse_adam_(param, grad, exp_avg, exp_avg_sq, visibility, lr, b1, b2, eps)
 
 

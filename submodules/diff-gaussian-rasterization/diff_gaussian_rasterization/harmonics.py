@@ -35,9 +35,10 @@ def sh_basis(degree: int, directions: Tensor) -> Tensor:
 
 
 def sh_values(degree: int, coefficients: Tensor, directions: Tensor) -> Tensor:
-    """Return the values of SH in directions, (N, D).
+    """Return the values of spherical harmonics in directions, (N, D).
 
-    coefficients: (N, K, D) of K >= (degree + 1)^2 bands.
+    degree: highest degree that counts.
+    coefficients: (N, K, D), K >= (degree + 1)^2 of them for each of D channels; those of higher degrees are not read.
     directions: (N, 3), of any length.
     """
     basis = sh_basis(degree, torch.nn.functional.normalize(directions, dim=-1))

@@ -60,7 +60,21 @@ class Lens(NamedTuple):
         return Lens(self.chart, *(tuple(values[a:b]) for a, b in zip((0, *ends), ends, strict=False)))
 
     def numbers(self, width: int, height: int) -> tuple[float, ...]:
-        """The operators' form for an image of that size (px). ValueError for numbers that no lens has."""
+        """Return the lens as the operators take it (gs::Lens in csrc/data.h): 7 numbers, then the 15 `values`.
+
+        ValueError for numbers that no lens has. The 7 numbers, in units of the chart where no other is named:
+
+        chart: index in _CHARTS.
+        limit: square of the largest distance from the axis that is shown.
+        reach: factor by which the distortion widens the view, at least 1.
+        field: distance from the axis at which the view ends (`field`).
+        steep: largest distance, px, by which a point within the field moves for a unit; of a fisheye, for a radian by
+            which its direction turns.
+        beyond: smallest distance, px, from the image of all that lies outside of the field.
+        slope: as steep, for a unit with any chart.
+
+        width, height: size of the image, px.
+        """
         if self.chart not in _CHARTS[1:]:
             raise ValueError(f"a lens's chart {self.chart!r} is none of {', '.join(_CHARTS[1:])}")
         more = self.values
@@ -80,10 +94,11 @@ class Lens(NamedTuple):
 
     @functools.lru_cache(maxsize=4096)  # noqa: B019  (a lens is a value)
     def _find_bounds(self, width: int, height: int) -> tuple[float, ...]:
-        """The field, where the distortion turns back, and how many times it widens the view, at least 1.
+        """Return field, turn, reach, steep, beyond and slope, all but `turn` as `numbers` explains them.
 
-        Then, for blocks that sleep, the steepest slope of pixels by the chart's numbers, or by a direction, and how far
-        off the image all is that lies beyond the field. Last, for rays, that by the chart's numbers.
+        turn: distance from the axis at which the distortion turns back, infinite if it never does. steep and beyond
+            tell whether a view may show a block of Gaussians that sleeps (csrc/math/sleep.h: blocks that no view shows
+            miss steps); slope is for Gaussians on their rays.
         """
         if self.chart == "equirectangular":
             return math.inf, math.inf, 1.0, math.inf, 0.0, max(self.focal)

@@ -1,9 +1,9 @@
 """Blending in two stages, each a function of autograd: projection, then an image of channels.
 
 The gradient of `splats` is moments (csrc/math/footprint.h) in place of gradients of their values, from which projection
-makes gradients without loss. A third stage may describe splats in between, as that of gsplat's function does. Then
-blending sends the moments to that stage, and beside them the gradients of means, conics and opacities, so that hooks
-see them.
+makes gradients without loss. An optional stage between the two describes splats: it turns them into the means, conics
+and opacities that programs of gsplat know (gsplat/description.py). Then blending sends the moments to that stage, and
+beside them the gradients of means, conics and opacities, so that hooks see them.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,27 +32,47 @@ class Blending(NamedTuple):
 
 
 class Shared:
-    """Messages that an image's stages exchange during a backward pass."""
+    """Messages that an image's stages exchange during a backward pass.
+
+    The stages are projection, blending and, between them, the optional description of splats (gsplat/description.py).
+
+    lengths: absolute gradients of means on the image (N,); blending writes, projection reads.
+    shown: (N,) int32, not 0 for rows that may have a gradient, by the image or by a loss of the described values; the
+        description writes, projection takes it in place of tile_counts and clears it. None: tile_counts tell.
+    use_lengths: function that gets `lengths`; gsplat's function sets, blending calls.
+    describe_moments: function that turns moments into gradients of means2d, conics and opacities, from splats,
+        tile_counts, moments and rows; the description sets, blending calls.
+    hooks: functions that return the hooks of a described tensor, None once it is gone; gsplat's function sets, the
+        description asks if there are any.
+
+    The last three are of `send` and `take`; blending writes, the description reads and clears:
+
+    task: number of autograd's backward pass that has sent moments.
+    moments: the moments (N, values).
+    sent: address and version of each gradient that went with them, by which changed gradients are found.
+    """
 
     __slots__ = ("describe_moments", "hooks", "lengths", "moments", "sent", "shown", "task", "use_lengths")
 
     def __init__(self) -> None:
         """Begin without a message."""
-        self.lengths: Tensor | None = None  # of absolute gradients, (N,)
-        self.shown: Tensor | None = None  # (N,) int32: not 0 of rows that get gradients beside those of the image
+        self.lengths: Tensor | None = None
+        self.shown: Tensor | None = None
         self.use_lengths: Callable[[Tensor], None] | None = None
-        # Gradients of means2d, conics and opacities as described, from splats, tile_counts, moments and rows.
         self.describe_moments: Callable[..., Sequence[Tensor]] | None = None
-        self.hooks: list[Callable[[], dict | None]] = []  # those of the description, each None once it is gone
+        self.hooks: list[Callable[[], dict | None]] = []
         self.task = self.moments = self.sent = None
 
     def send(self, moments: Tensor, gradients: Sequence[Tensor]) -> None:
-        """Keep moments and gradients, by which the stage that gets them recognises them."""
+        """Keep the moments of this backward pass, and marks by which the description recognises their gradients.
+
+        gradients: of means2d, conics and opacities, as blending returns them to autograd.
+        """
         self.task, self.moments = torch._C._current_graph_task_id(), moments
         self.sent = [(values.data_ptr(), values._version) for values in gradients]
 
     def take(self) -> tuple[Tensor | None, list]:
-        """Return what was sent in this pass: the moments, and the marks of the gradients."""
+        """Return the moments that were sent in this backward pass, and the marks of their gradients; else None, []."""
         now = self.task is not None and self.task == torch._C._current_graph_task_id()
         found = (self.moments, self.sent) if now else (None, [])
         self.task = self.moments = self.sent = None

@@ -1,4 +1,6 @@
-"""The description of splats, as programs of gsplat know them: a function of autograd between projection and blending.
+"""The description of splats: a function of autograd between projection and blending, for programs of gsplat.
+
+It turns splats into means, conics and opacities, as these programs know them.
 
 Gradients that come back from it changed are turned into moments (stages.py).
 """
