@@ -266,7 +266,9 @@ def _read_point(file: "_TextFile") -> tuple[int | float, ...]:
 
 def _table_of_points(rows: Sequence[Sequence[str | int | float]]) -> Points:
     """The points of rows of id, x, y, z, red, green, blue and error. ValueError where `_read_point` refuses one."""
-    table = np.array(rows, dtype=np.float64).reshape(-1, 8)
+    table = np.array(rows, dtype=np.float64) if rows else np.zeros((0, 8))
+    if table.shape[1:] != (8,):
+        raise ValueError("not eight numbers each")
     ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
     xyz, rgb = table[:, 1:4], table[:, 4:7]
     if not (np.isfinite(xyz.sum(axis=1)).all() and ((rgb >= 0) & (rgb <= 255)).all() and (ids >= 0).all()):

@@ -225,6 +225,7 @@ def test_foreign_content_is_refused_in_words(folder, tmp_path):
         (loader.read_extrinsics_text, "1 1 0 0 0 0 0 0 7 a.png\n1 2"),
         (loader.read_points3D_text, "1 0 0 x 9 9 9 0.5"),
         (loader.read_points3D_text, "1 0 0 0 9 9 9"),
+        (loader.read_points3D_text, "\n".join(["1 0 0 0 9 9 9"] * 8)),  # as many numbers as 7 points have
     ):
         path.write_text(f"# comment\n{line}\n")
         with pytest.raises(UserError, match="line [23] of .*file does not list"):

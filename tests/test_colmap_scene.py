@@ -18,7 +18,7 @@ from synthetic import CENTER, FOCAL, FakeGaussians, as_text, folder_state, make_
 from scene import Scene
 from scene.dataset_readers import scene_extent
 from scene.images.store import image_device
-from scene.readers.colmap import read_model
+from scene.readers.colmap import find_model, read_model
 from scene.readers.depth_maps import Metric
 from scene.readers.depth_scale import make_depth_params, make_metric_scale
 from scene.readers.point_cloud import read_point_cloud, write_point_cloud
@@ -282,3 +282,13 @@ def test_photos_of_another_aspect_than_a_camera_of_square_pixels(tmp_path, capsy
     said = capsys.readouterr().err
     assert "4 of 4 photos do not have the aspect ratio of their camera" in said
     assert ("its pixels are square (fx = fy), so the photos are rather padded or cropped" in said) == square
+
+
+def test_a_render_uses_the_model_of_several_that_its_training_does(colmap_scene):
+    """A model with broken points is none, though a render needs no points."""
+    as_text(colmap_scene)
+    sparse = colmap_scene / "sparse"
+    shutil.copytree(sparse / "0", sparse / "1")
+    with open(sparse / "0" / "points3D.txt", "a") as file:
+        file.write("99 0 0 x 9 9 9 0.5\n")
+    assert [find_model(colmap_scene, with_points)[0].name for with_points in (True, False)] == ["1", "1"]

@@ -88,7 +88,8 @@ def test_an_error_of_all_ranks_is_said_once(tmp_path):
 def test_no_rank_goes_on_after_one_has_stopped(colmap_scene, tmp_path):
     """Rank 0 has no fault of its own: what it saves is the model after the iteration in which the other stopped."""
     done = launch_fault(colmap_scene, tmp_path, "overflow 1 7")
-    (line,) = done.errors
+    # On a busy machine the other rank also says it before torchrun ends it.
+    (line,) = {line.replace("error: rank 1: ", "error: ") for line in done.errors}
     assert line.startswith("error: a step of iteration 7 (view "), line
     assert sorted(path.name for path in (tmp_path / "out").glob("chkpnt*")) == ["chkpnt5.pth", "chkpnt7.pth"]
     _train(colmap_scene, tmp_path / "one", "--no_curve", "--checkpoint_iterations", "7")

@@ -154,7 +154,8 @@ def find_model(scene: Path, with_points: bool = True) -> tuple[Path, ColmapModel
     models, errors = {}, []
     for folder in folders:
         try:
-            models[folder] = read_model(folder, with_points=with_points)
+            # Of several, one whose points are broken is not used: by a training and by a render alike.
+            models[folder] = read_model(folder, with_points=with_points or len(folders) > 1)
         except UserError as error:
             errors.append(error)
     if not models:

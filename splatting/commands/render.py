@@ -45,10 +45,10 @@ from groundwork.files.image_files import (
     write_png,
 )
 from groundwork.files.json_files import write_json
-from groundwork.host.machine import threads
 from groundwork.host.progress import Bar, in_threads
 from scene.cameras import Camera
 from scene.gaussian_model import GaussianModel
+from scene.images.store import ImageStore, Picture
 from scene.point_depths import PointDepths, held_out_points
 from scene.saved_model import load_saved
 from scene.scene import Scene
@@ -127,8 +127,13 @@ def _batches(views: list[Camera]) -> Iterator[list[Camera]]:
 
 def _truths(folder: Path, views: list[Camera], scored: ScoredViews, first: int) -> list[partial[None]]:
     """Return what writes the ground truth and masks of views, of which `first` is the number of the first one."""
-    if pictures := [picture for view in views for picture in getattr(view, "undecoded", ())]:
-        views[0].images.prefetch(pictures)
+    waiting: dict[ImageStore, list[Picture]] = {}  # views of a scene have one store, others one each
+    for view in views:
+        if pictures := getattr(view, "undecoded", None):
+            waiting.setdefault(view.images, []).extend(pictures)
+    for store, pictures in waiting.items():
+        store.limit = store.limit and max(store.limit, len(pictures))
+        store.prefetch(pictures)
     files = []
     for index, view in enumerate(views, first):
         name = f"{index:05d}.png"
@@ -209,11 +214,11 @@ def render_sets(
     """
     scene, background = _load_scene(dataset, iteration, sh_degree, ply, pipeline)
     drawn = scene.gaussians, pipeline, background, scene.halves, separate_sh
+    points = held_out_points(scene, dataset.source_path) if "depth" in planes and not skip_test else None
     if not skip_train:
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
         views = scene.getTestCameras()
-        points = held_out_points(scene, dataset.source_path) if "depth" in planes else None
         render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
         beside = extra_test_views(scene, pipeline, background)
         for name in BESIDE:
@@ -241,7 +246,7 @@ def _load_scene(
     load: function that loads a saved iteration; `saved_scene` also loads it without the scene.
     """
     options = copy.copy(dataset)
-    options.images_to_load = 2 * threads()  # photos and masks of a batch
+    options.images_to_load = 1  # each photo is used once; the store grows to those of a batch
     scene = load_file(options, ply, pipeline) if ply else load(options, iteration, sh_degree)
     if not ply and getattr(dataset, "other_scene", ""):
         scene.loaded_iter = f"{scene.loaded_iter}_{dataset.other_scene}"
