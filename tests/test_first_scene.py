@@ -71,7 +71,7 @@ def executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., n
         book = _read()
         _parameters(book).source += "".join(f"\n{name} = {value!r}" for name, value in parameters.items())
         book.cells.insert(0, nbformat.v4.new_code_cell(first))
-        return NotebookClient(book, timeout=120, resources={"metadata": {"path": str(work)}}).execute()
+        return NotebookClient(book, timeout=600, resources={"metadata": {"path": str(work)}}).execute()
 
     return execute
 
