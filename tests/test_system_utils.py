@@ -23,6 +23,12 @@ def _raise(error: BaseException) -> None:
     ("error", "status", "said"),
     [
         (UserError("fix it like this"), 2, "error: fix it like this\n"),
+        (
+            OSError(errno.EROFS, "Read-only file system", "m/times.json"),
+            2,
+            "error: the system refuses m/times.json (Read-only file system); fix its permissions, free space there, or "
+            "choose another place\n",
+        ),
         (KeyboardInterrupt("stopped from the page"), 130, "stopped from the page\n"),
     ],
 )
@@ -32,6 +38,8 @@ def test_run_cli_says_one_line_and_exits(error, status, said, capsys):
     assert exit_info.value.code == status and capsys.readouterr() == ("", said)
     with pytest.raises(ZeroDivisionError):  # a bug keeps its traceback
         run_cli(lambda: 1 / 0)
+    with pytest.raises(FileNotFoundError):
+        run_cli(lambda: _raise(FileNotFoundError(errno.ENOENT, "No such file", "a.txt")))
 
 
 @pytest.mark.parametrize(

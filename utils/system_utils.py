@@ -1,6 +1,7 @@
 """Files, folders, user errors and exit statuses for every command line."""
 
 import contextlib
+import errno
 import os
 import re
 import sys
@@ -30,6 +31,7 @@ __all__ = [
     "writes_files",
 ]
 
+_REFUSED = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT)  # by the system, for no fault of ours
 _ITERATION_FOLDER = re.compile(r"iteration_(\d+)")
 
 
@@ -39,7 +41,8 @@ def run_cli(main: Callable[[], object], several: bool = False) -> None:
     several: whether processes of torchrun may run it together (groundwork/ranks/launcher.py); else they are refused.
 
     Signals exit as in shells: Ctrl-C 130, SIGTERM 143, and 141 if the reader of the output is gone (`| head`). An
-    output that cannot be written (disk full) exits 2, and one that is closed does not matter.
+    output that cannot be written (disk full) exits 2, and one that is closed does not matter. A file or folder that the
+    system refuses exits 2.
     """
     start.after_imports()
     try:
@@ -49,13 +52,17 @@ def run_cli(main: Callable[[], object], several: bool = False) -> None:
         _discard_output()
         status = 141
     except OSError as error:
-        if error.filename is not None or not _is_output_broken():
-            raise
-        with contextlib.suppress(OSError):
-            reason = f"cannot write to the standard output ({error.strerror})"
-            print(f"error: {reason}; free space there, or send the output elsewhere", file=sys.stderr)
-        _discard_output()
         status = 2
+        if error.filename is not None and error.errno in _REFUSED:
+            remedy = "fix its permissions, free space there, or choose another place"
+            print(f"error: the system refuses {error.filename} ({error.strerror}); {remedy}", file=sys.stderr)
+        elif error.filename is not None or not _is_output_broken():
+            raise
+        else:
+            with contextlib.suppress(OSError):
+                reason = f"cannot write to the standard output ({error.strerror})"
+                print(f"error: {reason}; free space there, or send the output elsewhere", file=sys.stderr)
+            _discard_output()
     finally:
         let_signals_end()  # else one that comes now would print a traceback from Python's own end
     if status:
