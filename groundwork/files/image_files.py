@@ -44,7 +44,7 @@ VIDEO_SUFFIXES = (
 # What photos come in. Pillow knows more formats, and hands some of them, as PostScript, to other programs, whatever the
 # file's name is.
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP", "GIF", "PPM", "JPEG2000", "AVIF", "HEIF", "TGA")
-PNG_LEVEL = 1  # of zlib, as 6 takes four times as long for files that are 10 % smaller (docs/results/waiting.md)
+PNG_LEVEL = 1  # of zlib, as 6 takes four times as long for files that are 8 % smaller (docs/results/waiting.md)
 _PIXELS_HELD = 1 << 26  # of pictures that wait to be written
 SCALE = "scale"  # key of a plane's text chunk: value = pixel * scale
 _STEPS = 65535

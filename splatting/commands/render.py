@@ -95,8 +95,8 @@ def write_views(
         scored.whole(view, gaussians)
     # All cores read the photos of a batch, then its views are drawn, which nothing disturbs, then all cores write.
     with Bar(total=len(views), desc=f"Rendering {folder.parent.name}", unit="view", disable=not views) as bar:
-        for batch in _batches(views):
-            files = _truths(folder, batch, scored, bar.n)
+        for batch in _split_batches(views):
+            files = _prepare_truths(folder, batch, scored, bar.n)
             for index, view in enumerate(batch, bar.n):
                 _wait(background.device)
                 start = time.perf_counter()
@@ -119,14 +119,14 @@ def write_views(
     return seconds
 
 
-def _batches(views: list[Camera]) -> Iterator[list[Camera]]:
-    """Yield the views in lists of as many as are read, drawn and written at once."""
+def _split_batches(views: list[Camera]) -> Iterator[list[Camera]]:
+    """Split views into batches, each of which is read, drawn and written at once."""
     size = pictures_at_once(max((view.image_width * view.image_height for view in views), default=0))
     return (views[start : start + size] for start in range(0, len(views), size))
 
 
-def _truths(folder: Path, views: list[Camera], scored: ScoredViews, first: int) -> list[partial[None]]:
-    """Return what writes the ground truth and masks of views, of which `first` is the number of the first one."""
+def _prepare_truths(folder: Path, views: list[Camera], scored: ScoredViews, first: int) -> list[partial[None]]:
+    """Read the photos of views, and return the calls that write truth and masks. first: number of the first view."""
     waiting: dict[ImageStore, list[Picture]] = {}  # views of a scene have one store, others one each
     for view in views:
         if pictures := getattr(view, "undecoded", None):
