@@ -68,16 +68,20 @@ def judge(model: pycolmap.Reconstruction, database: str) -> dict[str, Any]:
     bound: number of photos that pairs connect, those without a pose included;
     rotation: see rotation_error;
     alike: photos to leave out so that no two stand in one place and show different things;
-    alike_pair: the clearest two of these, or None.
+    alike_pair: the clearest two of these, or None;
+    left: the verdict without the photos of `against` and `alike`.
     """
     compared = sorted(find_overlaps(model, database), key=lambda pair: -pair.empty)
     alike = [pair[:2] for pair in compared if pair.is_unmatched]
-    return verdict(list(judge_pairs(model, database))) | {
+    pairs = list(judge_pairs(model, database))
+    found = verdict(pairs) | {
         "bound": len(largest_component(_list_linked_pairs(database))),
         "rotation": rotation_error(database),
         "alike": find_cover(alike),
         "alike_pair": alike[0] if alike else None,
     }
+    out = {*found["against"], *found["alike"]}
+    return found | {"left": verdict([pair for pair in pairs if out.isdisjoint(pair[:2])])}
 
 
 def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
@@ -89,7 +93,7 @@ def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
     agreeing: number of photos in the largest group;
     against: photos that contradict this group; others may have no pair with it.
     """
-    groups = consistent_groups(pairs)
+    groups = consistent_groups((pair.first, pair.second, _weigh_pair(pair)) for pair in pairs)
     member = {name: number for number, group in enumerate(groups) for name in group}
     votes: dict[int, float] = {}
     for pair in pairs:
@@ -218,16 +222,15 @@ def own_angles(rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
     return error
 
 
-def consistent_groups(pairs: Iterable[Pair]) -> list[list[str]]:
-    """Group the photos of pairs so that pairs within a group agree with the model, and pairs between groups contradict.
+def consistent_groups(pairs: Iterable[tuple[Any, Any, float]]) -> list[list[Any]]:
+    """Group photos so that pairs within a group agree with the model, and pairs between groups contradict.
 
-    A pair votes by its matches, for or against its two photos in one group (`_weigh_pair`). The two groups with the
-    most votes between them are joined, while these are positive. Returns lists of names, the largest group first.
+    pairs: two photos each and their vote, for one group if positive, against it if negative. The two groups with the
+    most votes between them are joined, while these are positive. Returns lists of photos, the largest group first.
     """
-    votes: dict[str, dict[str, float]] = {}
-    for pair in pairs:
-        for one, other in ((pair.first, pair.second), (pair.second, pair.first)):
-            votes.setdefault(one, {})[other] = _weigh_pair(pair)
+    votes: dict[Any, dict[Any, float]] = {}
+    for first, second, vote in pairs:
+        votes.setdefault(first, {})[second] = votes.setdefault(second, {})[first] = vote
     groups = {name: [name] for name in votes}
     heap = [(-vote, one, other) for one, row in votes.items() for other, vote in row.items() if vote > 0]
     heapq.heapify(heap)

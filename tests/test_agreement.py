@@ -109,14 +109,15 @@ def _pair(one: str, other: str, wrong: bool = False, matches: int = 50) -> agree
 
 
 def test_groups_are_those_between_which_pairs_contradict():
-    chain = [_pair(a, b) for a, b in ("ab", "bc", "ac", "de", "ef", "df")]
-    groups = agreement.consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=20)])
+    chain = [(a, b, 50) for a, b in ("ab", "bc", "ac", "de", "ef", "df")]
+    groups = agreement.consistent_groups([*chain, ("c", "d", -50), ("a", "f", 20)])
     assert [sorted(group) for group in groups] == [[*"abc"], [*"def"]]
-    groups = agreement.consistent_groups([*chain, _pair("c", "d", wrong=True), _pair("a", "f", matches=60)])
+    groups = agreement.consistent_groups([*chain, ("c", "d", -50), ("a", "f", 60)])
     assert [sorted(group) for group in groups] == [[*"abcdef"]]
     # Hundreds of matches of two photos that show nearly the same do not outvote several other pairs.
-    voted = [_pair("a", "d", matches=900), *(_pair(a, b, wrong=True) for a, b in ("bd", "cd", "be"))]
-    assert len(agreement.consistent_groups([*chain, *voted])) == 2
+    pairs = [_pair(a, b) for a, b, _ in chain] + [_pair("a", "d", matches=900)]
+    pairs += [_pair(a, b, wrong=True) for a, b in ("bd", "cd", "be")]
+    assert agreement.verdict(pairs)["agreeing"] == 4
 
 
 def test_pairs_of_a_database_judge_a_model(tmp_path):
@@ -157,12 +158,14 @@ def _mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: dict[str,
     )  # fmt: skip
     work.mkdir()
     backend = SimpleNamespace(
-        layout=layout, settings=SimpleNamespace(mapper="auto"), ways=("global", "simple", "incremental", "free"),
-        calibration=lambda: [], mapping=lambda way, models: [(way, models)],
+        layout=layout, settings=SimpleNamespace(mapper="auto"),
+        ways=("direct", "grown", "global", "incremental", "free"),
+        calibration=lambda: [], mapping=lambda way, models, **job: [(way, models, job)],
     )  # fmt: skip
 
-    def place(_: str, commands: list[tuple[str, Path]]) -> None:
-        ((way, models),) = commands
+    def place(_: str, commands: list[tuple[str, Path, dict]]) -> None:
+        ((way, models, job),) = commands
+        assert ("base" in job) == (way == "grown")
         done.append(way)
         if way not in agreeing:
             raise UserError("no such way")
@@ -172,7 +175,8 @@ def _mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: dict[str,
     def run(commands: list, title: str) -> None:
         if title == "Judging":
             right = {"folder": "0", "pairs": 99, "agreeing": agreeing[done[-1]], "contradicting": 0.01, "against": []}
-            (work / "judging.json").write_text(json.dumps(right | {"error": 0.1, "own_error": 0.1} | found))
+            right |= {"error": 0.1, "own_error": 0.1} | found
+            (work / "judging.json").write_text(json.dumps(right | {"left": right}))
         elif title == "Leaving out photos":
             left_out.extend(json.loads(Path(commands[0][2]).read_text())["left_out"])
 
@@ -185,18 +189,19 @@ def _mapped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: dict[str,
 
 
 @pytest.mark.parametrize(
-    ("count", "agreeing", "tried", "kept"),
+    ("count", "agreeing", "found", "tried", "kept"),
     [
-        (20, {"incremental": 20}, ["incremental"], "incremental"),
-        (20, {"incremental": 12, "global": 19}, ["incremental", "global"], "global"),
-        (90, {"global": 90}, ["global"], "global"),
-        (90, {"global": 50, "simple": 40, "incremental": 70, "free": 60},
-         ["global", "simple", "incremental", "free"], "incremental"),
-        (90, {"incremental": 89}, ["global", "simple", "incremental"], "incremental"),  # the first two fail
+        (20, {"direct": 20}, {}, ["direct"], "direct"),
+        (20, {"incremental": 20}, {}, ["direct", "incremental"], "incremental"),
+        (20, {"incremental": 12, "global": 19}, {}, ["direct", "incremental", "global"], "global"),
+        (90, {"global": 90}, {}, ["direct", "global"], "global"),
+        (90, {"direct": 60, "grown": 85}, {"against": ["7.jpg"]}, ["direct", "grown"], "grown"),
+        (90, {"direct": 9, "global": 50, "incremental": 70, "free": 60}, {},
+         ["direct", "global", "incremental", "free"], "incremental"),
     ],
 )  # fmt: skip
-def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, tried, kept):
-    done, judged, _ = _mapped(tmp_path, monkeypatch, agreeing, photos=count, bound=count)
+def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, agreeing, found, tried, kept):
+    done, judged, _ = _mapped(tmp_path, monkeypatch, agreeing, photos=count, bound=count, **found)
     assert done == tried and judged[0]["way"] == kept and len(judged) == len(tried)
     assert capsys.readouterr().out.count("; trying ") == len(tried) - 1
 
@@ -210,7 +215,7 @@ def test_ways_are_tried_until_one_agrees(tmp_path, monkeypatch, capsys, count, a
     ],
 )
 def test_pairs_that_mislead(tmp_path, monkeypatch, found, tried, left_out):
-    agreeing = dict.fromkeys(("global", "simple", "incremental", "free"), 20)
+    agreeing = dict.fromkeys(("direct", "global", "incremental", "free"), 20)
     done, judged, out = _mapped(tmp_path, monkeypatch, agreeing, photos=20, bound=20, **found)
     assert len(done) == tried and out == left_out and is_wrong(judged[0]) == (not left_out)
 

@@ -84,7 +84,7 @@ class Backend:
 
     def __init__(self, layout: Layout, settings: Settings) -> None:
         self.layout, self.settings = layout, settings
-        self.ways = ("global", "simple", "incremental", "free") if settings.mapper == "auto" else (settings.mapper,)
+        self.ways = ("global", "incremental") if settings.mapper == "auto" else (settings.mapper,)
 
     def calibration(self) -> list[Command]:
         """Commands that write focal lengths into `layout.calibrated`, a copy of the database."""
@@ -97,6 +97,8 @@ class Pycolmap(Backend):
     def __init__(self, layout: Layout, settings: Settings) -> None:
         super().__init__(layout, settings)
         self.identity = f"pycolmap {version('pycolmap')}"
+        if settings.mapper == "auto":
+            self.ways = ("direct", "grown", "global", "incremental", "free")
 
     def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
         return self._make_commands("features", groups=groups, masks=str(self.layout.masks) if masks else "")
@@ -104,9 +106,9 @@ class Pycolmap(Backend):
     def matching(self) -> list[Command]:
         return self._make_commands("matching", all_of=ALL_PAIRS)
 
-    def mapping(self, way: str, models: Path) -> list[Command]:
+    def mapping(self, way: str, models: Path, **job: Any) -> list[Command]:
         step = way if way in (GIVEN, ADDING) else "mapping"
-        places = {"models": str(models), "calibrated": str(self.layout.calibrated)}
+        places = {"models": str(models), "calibrated": str(self.layout.calibrated), **job}
         return self._make_commands(step, mapper=way, tolerance=TOLERANCE, **places)
 
     def _make_commands(self, step: str, **job: Any) -> list[Command]:
@@ -162,8 +164,8 @@ class Program(Backend):
                 f"{executable} ({self.identity}) has no global_mapper; use --mapper incremental, or omit "
                 "--colmap_executable to use pycolmap's global mapper"
             )
-        if settings.mapper == "auto":
-            self.ways = ("global", "incremental") if self._maps_globally else ("incremental",)
+        if settings.mapper == "auto" and not self._maps_globally:
+            self.ways = ("incremental",)
 
     def features(self, groups: list[list[str]], masks: bool) -> list[Command]:
         """Return the commands that write SIFT features into the database: one for each group of photos.

@@ -30,7 +30,8 @@ from utils.system_utils import UserError
 AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
 _FOLDED = 2  # ways that fold a scene, after which no other is tried
 _NAMES = {
-    "simple": "global mapping, at first without distortion",
+    "direct": "direct global mapping",
+    "grown": "incremental mapping from the photos that agree",
     "free": "incremental mapping without given focal lengths",
 }
 
@@ -50,15 +51,20 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     except UserError as error:  # some ways do without
         print(f"warning: focal lengths could not be estimated: {error}", file=sys.stderr)
     tried: list[dict[str, Any]] = []
-    few = count_rows(layout.database, "images") <= ALL_PAIRS
-    ways = sorted(backend.ways, key=lambda way: (way == "free", few and way != "incremental"))
-    for number, way in enumerate(ways):
-        title = "Mapping" if not number else f"Mapping, try {number + 1}"
-        tried.append(_try_way(backend, way, partial(place, title), run))
+    ways = list(backend.ways)
+    if count_rows(layout.database, "images") <= ALL_PAIRS and {"global", "incremental"} <= {*ways}:
+        ways.remove("global")  # the incremental way takes no longer for so few, and more often succeeds
+        ways.insert(ways.index("incremental") + 1, "global")
+    while ways:
+        way = ways.pop(0)
+        title = "Mapping" if not tried else f"Mapping, try {len(tried) + 1}"
+        tried.append(_try_way(backend, way, partial(place, title), run, *tried[-1:]))
         if is_accepted(tried[-1]) or is_only_turned(tried[-1]) or sum(map(is_folded, tried)) == _FOLDED:
             break
-        if number + 1 < len(ways):
-            print(f"{_describe_try(tried[-1])}; trying {way_name(ways[number + 1])}")
+        if ways[:1] == ["grown"] and not tried[-1].get("against"):
+            ways.pop(0)
+        if ways:
+            print(f"{_describe_try(tried[-1])}; trying {way_name(ways[0])}")
     tried = sorted(tried, key=partial(_rank_model, tried), reverse=True)
     best = tried[0]
     if "failed" in best:
@@ -75,8 +81,9 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     if best.get("against") and not is_folded(best):
         model = str(layout.models / best["folder"])
         run([worker_command(layout, "keep", model=model, left_out=best["against"])], "Leaving out photos")
-        best |= {**_judge_models(backend, layout.models, run), "against": best["against"]}  # of those that are left
-    write_json(layout.judged, tried)
+        left = {**best["left"], "photos": best["photos"] - len(best["against"]), "alike": [], "alike_pair": None}
+        best |= {**left, "against": best["against"]}
+    write_json(layout.judged, [{name: value for name, value in one.items() if name != "left"} for one in tried])
 
 
 def is_accepted(found: Mapping[str, Any]) -> bool:
@@ -85,12 +92,22 @@ def is_accepted(found: Mapping[str, Any]) -> bool:
 
 
 def _try_way(
-    backend: Backend, way: str, place: Callable[[list[Command]], None], run: Callable[..., None]
+    backend: Backend,
+    way: str,
+    place: Callable[[list[Command]], None],
+    run: Callable[..., None],
+    before: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Map in one way, and return the judgement of the models, or a message `failed` instead."""
+    """Map in one way, and return the judgement of the models, or a message `failed` instead.
+
+    before: judgement of the way before, from whose sound part `grown` begins.
+    """
     start, models = time.monotonic(), backend.layout.tried / way
+    job = {}
+    if way == "grown" and before:
+        job = {"base": str(backend.layout.tried / before["way"] / before["folder"]), "left_out": before["against"]}
     try:
-        place(backend.mapping(way, models))
+        place(backend.mapping(way, models, **job))
         found = _judge_models(backend, models, run)
     except UserError as error:
         found = {"failed": str(error)}

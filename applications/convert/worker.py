@@ -24,6 +24,8 @@ import pycolmap
 
 from applications.convert import pairing
 from applications.convert.database import opened
+from applications.convert.global_sfm.mapper import map_globally
+from applications.convert.global_sfm.pairs import pose_pairs
 from applications.convert.reduced import ABOUT, ENLARGED, FEW, choose_longest_side, read_enlarged, reduce_photos
 from scene.agreement import judge
 
@@ -137,35 +139,45 @@ def _assume_focal_lengths(database_path: str) -> None:
 
 
 def calibrate(job: dict[str, Any]) -> None:
-    """Estimate focal lengths from pairs, where photos do not tell them, and write them into the database."""
+    """Estimate focal lengths from pairs, where photos do not tell them, and write them and the pairs' poses."""
     options = pycolmap.ViewGraphCalibrationOptions()
-    options.random_seed = SEED
+    options.random_seed, options.reestimate_relative_pose = SEED, False
     pycolmap.calibrate_view_graph(job["calibrated"], options)
+    pose_pairs(job["calibrated"])
 
 
 def mapping(job: dict[str, Any]) -> None:
     """Compute poses and points in the way `mapper`; write one or more models into sub-folders of `models`.
 
-    All but free begin with the focal lengths of `calibrate`. simple is global, with lenses without distortion until all
-    photos are placed: where few points hold each photo, distortion otherwise bends the scene.
+    All but free begin with the focal lengths of `calibrate`. direct is that of global_sfm. grown is incremental, from
+    the model `base` without the photos `left_out`.
     """
     os.makedirs(job["models"])
-    database = job["database" if job["mapper"] == "free" else "calibrated"]
-    if job["mapper"] in ("global", "simple"):
+    way, photos = job["mapper"], _choose_photo_folder(job)
+    database = job["database" if way == "free" else "calibrated"]
+    if way == "direct":
+        for number, model in enumerate(map_globally(job["database"], database, photos, THREADS)):
+            folder = Path(job["models"], str(number))
+            folder.mkdir()
+            model.write(str(folder))
+        return
+    if way == "global":
         options = pycolmap.GlobalPipelineOptions()
         options.random_seed, options.num_threads = SEED, THREADS
         if _is_dense(database):
             options.mapper.track_required_tracks_per_view = TRACKS
-        options.mapper.bundle_adjustment.refine_extra_params = job["mapper"] == "global"
-        models = pycolmap.global_mapping(database, _choose_photo_folder(job), job["models"], options)
-        for number, model in models.items() if job["mapper"] == "simple" else ():
-            pycolmap.bundle_adjustment(model, pycolmap.BundleAdjustmentOptions(print_summary=False))
-            model.update_point_3d_errors()
-            model.write(str(Path(job["models"], str(number))))
+        pycolmap.global_mapping(database, photos, job["models"], options)
         return
     options = _make_incremental_options(job)
     options.min_model_size = 3  # a small model is better than none; the report shows its size
-    pycolmap.incremental_mapping(database, _choose_photo_folder(job), job["models"], options)
+    if way != "grown":
+        pycolmap.incremental_mapping(database, photos, job["models"], options)
+        return
+    keep(job | {"model": job["base"]})
+    options.multiple_models = False
+    folder = Path(job["models"], "0")
+    folder.mkdir()
+    pycolmap.incremental_mapping(database, photos, str(folder), options, job["base"])
 
 
 def _choose_photo_folder(job: dict[str, Any]) -> str:
@@ -185,7 +197,8 @@ def keep(job: dict[str, Any]) -> None:
     """Take the photos `left_out` out of the model in the folder `model`."""
     model = pycolmap.Reconstruction(job["model"])
     for name in job["left_out"]:
-        model.deregister_frame(model.find_image_with_name(name).frame_id)
+        if image := model.find_image_with_name(name):
+            model.deregister_frame(image.frame_id)
     model.write(job["model"])
 
 
