@@ -28,13 +28,14 @@ from groundwork.files.unread import note_unread
 from scene.gaussians.ply import frame_comments, read_ply, read_vertices, write_ply
 from scene.readers.info import origin_near
 from scene.splats.packing import morton_order, pack, smallest_three, spread, unpack, whole_quaternions
-from scene.splats.splats import Splats, base_colors, logits, opacities, selected
+from scene.splats.splats import Splats, base_colors, logits, opacities, selected, with_sh_degree
 from utils.sh_utils import C0
 from utils.system_utils import UserError, atomic_write
 
 AXES = "axes x right, y down, z forward (COLMAP)"
 CHUNK = 256
 SH_RANGE = 8.0  # coefficients from -4 to 4
+_TOGETHER = 4096  # splats whose SH bands are packed at once: they fit into the processor's cache
 _LOG_SCALES = 20.0  # beyond this, readers clamp
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _VISIBLE = ("packed_position", "packed_scale", "packed_color")  # all zero in padding
@@ -161,7 +162,8 @@ def write_compressed_ply(path: str | os.PathLike, splats: Splats) -> None:
 def packed_ply(splats: Splats) -> PlyData:
     """The tables of a compressed PLY and its comments."""
     order, padding = _order_in_chunks(splats)
-    splats = selected(splats, order)
+    rest = _encode_rest(splats.sh[:, 1:])[order]  # bytes are put in order faster than floats
+    splats = selected(with_sh_degree(splats, 0), order)
     count = len(splats)
     first = np.arange(0, count, CHUNK)
     chunk_of = np.arange(count) // CHUNK
@@ -185,11 +187,19 @@ def packed_ply(splats: Splats) -> PlyData:
         vertex[name][padding] = 0
     chunks = _make_element("chunk", sum(_COLUMNS.values(), []), np.concatenate(ranges, axis=1), "<f4")
     elements = [chunks, PlyElement.describe(vertex, "vertex")]
-    if splats.sh_degree:
-        codes = np.floor((splats.sh[:, 1:] / np.float32(SH_RANGE) + np.float32(0.5)) * 256)  # float64 would take GBs
-        codes = codes.clip(0, 255).astype(np.uint8).transpose(0, 2, 1).reshape(count, 3 * (splats.sh.shape[1] - 1))
-        elements.append(_make_element("sh", [f"f_rest_{i}" for i in range(codes.shape[1])], codes, "u1"))
+    if rest.shape[1]:
+        elements.append(_make_element("sh", [f"f_rest_{i}" for i in range(rest.shape[1])], rest, "u1"))
     return PlyData(elements, byte_order="<", comments=comments(splats))
+
+
+def _encode_rest(sh: np.ndarray) -> np.ndarray:
+    """SH coefficients above band 0, (N, K, 3), as bytes (N, 3 K), channel by channel."""
+    codes = np.empty((len(sh), 3, sh.shape[1]), np.uint8)
+    for first in range(0, len(sh), _TOGETHER):
+        some = slice(first, first + _TOGETHER)
+        levels = np.floor((sh[some] / np.float32(SH_RANGE) + np.float32(0.5)) * 256)
+        codes[some] = levels.clip(0, 255).astype(np.uint8).transpose(0, 2, 1)
+    return codes.reshape(len(sh), 3 * sh.shape[1])
 
 
 def _order_in_chunks(splats: Splats) -> tuple[np.ndarray, np.ndarray]:

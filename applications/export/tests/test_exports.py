@@ -22,6 +22,8 @@ from applications.export import scene_formats
 from applications.export.formats import FORMATS, find_format
 from gaussian_renderer.free_view import rotation_matrix
 from scene.export_world import export_world
+from scene.splats import ply
+from scene.splats import splats as splats_module
 from scene.splats.ply import CHUNK
 from scene.splats.reading import read_splats
 from scene.splats.splats import (
@@ -320,6 +322,19 @@ def test_models_and_splats_are_the_same_gaussians():
     scales = np.exp(splats_of(gaussians).log_scales)
     np.testing.assert_allclose(scales, gaussians.get_scaling.detach().numpy(), rtol=1e-5)
     assert model_of(splats(4, 1), 3).active_sh_degree == 1 and model_of(splats(4, 3), 1).max_sh_degree == 1
+
+
+def test_pieces_of_many_splats_are_turned_and_packed_as_all_at_once():
+    rng, turn = np.random.default_rng(0), rotation_matrix((0.8, 0.4, 0.4, 0.2))
+    for count, degree in ((0, 3), (1, 1), (splats_module._TOGETHER + 3, 2), (2 * splats_module._TOGETHER, 3)):
+        sh = rng.normal(0, 2, (count, (degree + 1) ** 2, 3)).astype(np.float32)
+        matrix = splats_module._make_sh_rotation(degree, turn).astype(np.float32)
+        turned = np.einsum("jk,nkc->njc", matrix, sh.astype(np.float64))
+        np.testing.assert_allclose(splats_module._rotate_sh(sh, matrix), turned, rtol=0, atol=1e-5)
+        codes = np.clip(np.floor((sh[:, 1:] / np.float32(ply.SH_RANGE) + np.float32(0.5)) * 256), 0, 255)
+        np.testing.assert_array_equal(
+            ply._encode_rest(sh[:, 1:]), codes.swapaxes(1, 2).reshape(count, 3 * codes.shape[1])
+        )
 
 
 def test_selection():
