@@ -99,18 +99,19 @@ def views_between(first: Camera, second: Camera) -> list[MiniCam]:
     Positions, focal lengths and principal points are interpolated linearly, orientations along the shortest rotation
     (slerp). Where the sizes differ, the larger width and height count.
     """
-    return [_interpolate_view(first, second, fraction) for fraction in FRACTIONS]
-
-
-def _interpolate_view(first: Camera, second: Camera, fraction: float) -> MiniCam:
-    """Interpolate the view between two cameras, from the first (fraction 0) to the second (1), a little wider than
-    both."""
     from scipy.spatial.transform import Rotation, Slerp
+
+    turns = Slerp([0, 1], Rotation.from_matrix([first.R, second.R]))(FRACTIONS).as_matrix()
+    return [_interpolate_view(first, second, *place) for place in zip(FRACTIONS, turns, strict=True)]
+
+
+def _interpolate_view(first: Camera, second: Camera, fraction: float, turn: np.ndarray) -> MiniCam:
+    """Interpolate the view between two cameras, from the first (fraction 0) to the second (1), a little wider than
+    both. turn: rotation (3, 3) from the view's axes to the world's."""
 
     def mixed(one: float, other: float) -> float:
         return (1 - fraction) * one + fraction * other
 
-    turn = Slerp([0, 1], Rotation.from_matrix([first.R, second.R]))(fraction).as_matrix()
     center = mixed(*(camera_center(camera.R, camera.T) for camera in (first, second)))
     width = math.ceil(WIDER * max(first.image_width, second.image_width))
     height = math.ceil(WIDER * max(first.image_height, second.image_height))

@@ -36,6 +36,7 @@ from utils.system_utils import UserError, compute_device
 OPTION = {"type": float, "nargs": "?", "const": 0.05, "metavar": "DB"}  # --clean, as argparse takes it
 _STEPS = 1000  # a search ends within N / _STEPS of the most that may go
 _EXACT = 1e-12  # least squared error of a view
+_TOGETHER = 8  # most views that are scored before a GPU is waited for
 _SHOWN = 3  # views of the picture
 
 
@@ -53,15 +54,22 @@ class Cleaning:
         """
         self._gaussians, self._cameras, self._views, self._most = gaussians, list(cameras), views, most
         self.keep = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.get_xyz.device)
-        self.before = {id(camera): self._measure_psnr(camera, gaussians) for camera in self._cameras}
+        scores = self._measure_psnrs(self._cameras, gaussians)
+        self.before = {id(camera): psnr for camera, psnr in zip(self._cameras, scores, strict=True)}
         self.after = dict(self.before)
         self._best = dict(self.before)
 
     def _make_part(self, keep: Tensor) -> GaussianModel:
         return self._gaussians.part(keep, self._gaussians.max_sh_degree)
 
-    def _measure_psnr(self, camera: Camera, gaussians: GaussianModel) -> float:
-        return self._views.scores([camera], gaussians).get("psnr", float("inf"))
+    def _measure_psnrs(self, cameras: Sequence[Camera], gaussians: GaussianModel) -> list[float]:
+        """PSNR of each view, dB, infinite where no pixel counts. A GPU is waited for once."""
+        return torch.stack([-10.0 * self._measure_error(camera, gaussians).log10() for camera in cameras]).tolist()
+
+    def _measure_error(self, camera: Camera, gaussians: GaussianModel) -> Tensor:
+        """Mean squared error of a view, 0 where no pixel counts."""
+        image, target, mask = self._views.compared(camera, gaussians)
+        return pixels_that_count(image - as_float(target), mask).square().mean()
 
     def _score_part(self, keep: Tensor) -> dict[int, float] | None:
         """Return the PSNR by view of a part of the model; None if a view loses too much.
@@ -69,12 +77,15 @@ class Cleaning:
         That view is scored first from then on.
         """
         gaussians, found = self._make_part(keep), {}
-        for camera in self._cameras:
-            found[id(camera)] = self._measure_psnr(camera, gaussians)
-            if self._best[id(camera)] - found[id(camera)] > self._most:
-                self._cameras.remove(camera)
-                self._cameras.insert(0, camera)
-                return None
+        while len(found) < len(self._cameras):
+            # The first ones fail most often, so they are waited for one by one.
+            some = self._cameras[len(found) :][: min(max(len(found), 1), _TOGETHER)]
+            for camera, psnr in zip(some, self._measure_psnrs(some, gaussians), strict=True):
+                found[id(camera)] = psnr
+                if self._best[id(camera)] - psnr > self._most:
+                    self._cameras.remove(camera)
+                    self._cameras.insert(0, camera)
+                    return None
         return found
 
     def leave_out(self, order: Tensor) -> None:
@@ -98,15 +109,16 @@ class Cleaning:
 
     def changes(self) -> Tensor:
         """Return by how much the views' errors change without each Gaussian, relative to these errors: (N,) float64."""
-        gaussians, found = self._make_part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
+        gaussians = self._make_part(self.keep)
+        found = gaussians.get_xyz.new_zeros(len(gaussians), dtype=torch.float64)
         for camera in Bar(self._cameras, desc="Asking the photos", unit="view", leave=False):
+            mask = self._views.mask(camera)
+            if mask is not None and not mask.any():
+                continue
             with torch.enable_grad():
-                image, target, mask = self._views.compared(camera, gaussians)
-                if mask is not None and not mask.any():
-                    continue
-                error = pixels_that_count(image - as_float(target), mask).square().mean()
-                found[self.keep] += change_without(error, gaussians) / error.detach().double().clamp_min(_EXACT)
-        return found.nan_to_num(0.0)
+                error = self._measure_error(camera, gaussians)
+                found += change_without(error, gaussians) / error.detach().double().clamp_min(_EXACT)
+        return self._spread(found)
 
     def added(self) -> Tensor:
         """Return the largest share that each Gaussian has in a view: (N,) float64.
@@ -114,7 +126,8 @@ class Cleaning:
         The share is the sum of the Gaussian's blending weights, divided by the view's pixels and by its error. The
         views are the training views, and views between neighbours, which may show Gaussians that the photos do not.
         """
-        gaussians, found = self._make_part(self.keep), torch.zeros_like(self.keep, dtype=torch.float64)
+        gaussians = self._make_part(self.keep)
+        found = gaussians.get_xyz.new_zeros(len(gaussians), dtype=torch.float64)
         errors = [max(10 ** (-self.after[id(camera)] / 10), _EXACT) for camera in self._cameras]
         pairs = neighbours(self._cameras, 0)
         between = chain.from_iterable(views_between(self._cameras[i], self._cameras[j]) for i, j in pairs)
@@ -125,8 +138,14 @@ class Cleaning:
             black = gaussians.get_xyz.new_zeros(3)
             weights = weighted_sums(camera, gaussians, self._views.pipe, black, torch.ones_like)[:, 0].double()
             weights /= error * camera.image_width * camera.image_height
-            found[self.keep] = torch.maximum(found[self.keep], weights)
-        return found.nan_to_num(0.0)
+            found = torch.maximum(found, weights)
+        return self._spread(found)
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """Values (n,) of the Gaussians that stay as those of all (N,): zero for the others, and where not a number."""
+        every = torch.zeros_like(self.keep, dtype=values.dtype)
+        every[self.keep] = values
+        return every.nan_to_num(0.0)
 
 
 def _halve_view(view: MiniCam) -> MiniCam:
@@ -187,7 +206,9 @@ def write_comparison(
     """Write a PNG of the views that change most, with a row for each view: before, gone, after."""
     degree = gaussians.max_sh_degree
     gone, after = gaussians.part(~keep, degree), gaussians.part(keep, degree)
-    changes = [float((views.image(c, gaussians) - views.image(c, after)).square().mean()) for c in cameras]
+    changes = torch.stack(
+        [(views.image(c, gaussians) - views.image(c, after)).square().mean() for c in cameras]
+    ).tolist()
     chosen = sorted(range(len(cameras)), key=lambda k: -changes[k])[:_SHOWN]
     rows = [
         [(name, Image.fromarray(to_bytes(views.image(cameras[k], model)).numpy())) for name, model in

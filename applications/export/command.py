@@ -41,6 +41,7 @@ from gaussian_renderer.scored_views import ScoredViews
 from gaussian_renderer.trimming import change_on_views
 from groundwork.files.json_files import read_model_json
 from groundwork.files.ours import refuse_foreign
+from groundwork.host.memory import free_memory
 from scene.cameras import Camera
 from scene.saved_model import find_save, load_saved, read_model
 from scene.scene import Scene
@@ -56,6 +57,7 @@ if TYPE_CHECKING:  # SciPy takes a while to import
     from gaussian_renderer.camera_paths.keyframes import TimedPath
     from gaussian_renderer.camera_paths.poses import Poses
 
+_PHOTOS = 0.25  # of the free memory, that the photos of a cleaning may take
 FOR_PHONES = 500_000  # Gaussians of a page
 FEWEST = 100  # triangles that --triangles may ask for
 _DETAILS = "voxel", "triangles", "start", "title", "notes", "walk"  # of `SceneInputs`
@@ -75,9 +77,12 @@ def load(
         )
     record = recorded_cameras_file(options) if needs_views and not needs_photos else None
     if needs_views and record is None:
-        options.images_to_load = 1  # each image is used once or twice
+        cleaned = bool(_list_cleaned_files(args))
+        options.images_to_load = 0 if cleaned else 1  # a cleaning uses each photo many times, all else once or twice
         smooth = argparse.Namespace(antialiasing=bool(args.antialiasing))
         scene = load_file(options, args.ply, smooth) if args.ply else load_saved(options, args.iteration)
+        if cleaned:
+            _keep_photos(scene)
         return splats_of(scene.gaussians, smooth.antialiasing), scene
     if args.ply:
         splats = read_any(args.ply)
@@ -91,6 +96,15 @@ def load(
         return splats, None
     cameras = recorded_cameras(record, options.resolution)
     return splats, WithoutScene(model_of(splats), options.model_path, args.iteration, cameras)
+
+
+def _keep_photos(scene: Scene) -> None:
+    """Begin to decode the photos of the training views, all of which are kept; one of them where memory is short."""
+    free = free_memory(scene.images.keep_on)
+    if free is not None and scene.images.planned_bytes > _PHOTOS * free:
+        scene.images.limit = 1
+    else:
+        scene.prefetch(scene.getTrainCameras())
 
 
 @torch.no_grad()

@@ -14,6 +14,8 @@ from benchmarks.exports import cleaning as benchmark
 from benchmarks.exports.cleaning import losses, with_floaters
 from gaussian_renderer.camera_paths.poses import poses_of
 from gaussian_renderer.scored_views import ScoredViews
+from scene.images import store
+from scene.images.decode import decode
 from scene.saved_model import load_saved
 from scene.splats.reading import read_splats
 from scene.with_splats import model_of, splats_of
@@ -75,11 +77,13 @@ def test_no_view_loses_more_than_allowed(cleaned, trained, views):
 def test_export_says_and_draws_what_goes(cleaned, trained, tmp_path, monkeypatch, capsys):
     model, scene = trained
     gone = int((~cleaned[0].keep).sum())
-    drawn = []
+    drawn, photos = [], []
     monkeypatch.setattr(cleaning, "sheet", lambda *content: drawn.append(content) or sheet(*content))
+    monkeypatch.setattr(store, "decode", lambda path, size: photos.append(path) or decode(path, size))
     words = ["export.py", "-m", str(model), "--to", str(tmp_path / "a.ply"), "--clean"]
     monkeypatch.setattr("sys.argv", [*words, "--to", str(tmp_path / "b.spz"), "--to", str(tmp_path / "c.html")])
     export.main()
+    assert len(photos) == len(set(photos)) == len(scene.getTrainCameras())
     said = capsys.readouterr().out
     assert f"--clean 0.05: {gone:,} of {len(scene.gaussians):,} Gaussians go" in said and " most, by -0.0" in said
     assert len(read_splats(tmp_path / "a.ply")) == len(scene.gaussians) - gone
@@ -91,6 +95,12 @@ def test_export_says_and_draws_what_goes(cleaned, trained, tmp_path, monkeypatch
     assert len(read_splats(tmp_path / "b.spz")) == len(scene.gaussians) - gone
     pictures = sorted(path.name for path in tmp_path.glob("*.removed.png"))
     assert pictures == ["a.ply.removed.png"] and (tmp_path / "c.html").is_file()
+    files = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(export, "_PHOTOS", 0.0)  # as where memory is short
+    monkeypatch.setattr("sys.argv", [*words, "--to", str(tmp_path / "b.spz"), "--to", str(tmp_path / "c.html")])
+    export.main()
+    assert len(photos) > 5 * len(set(photos))
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == files
     monkeypatch.setattr("sys.argv", [*words, "0"])
     with pytest.raises(UserError, match="--clean must be above 0 dB, got 0.0"):
         export.main()
