@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -150,6 +151,54 @@ def test_frames_of_an_earlier_run_are_removed_and_nothing_else(run, tmp_path):
     assert written(folder) == ["a.mp4", "a/00000.png", "a/00001.png", "a/00002.png", "a/notes.png"]
     run("--path", tmp_path / "a.json", "--fps", 2)
     assert written(folder) == ["a.mp4", "a/notes.png"]
+
+
+def test_the_next_frames_are_drawn_while_the_encoder_is_busy(run, monkeypatch):
+    drawn, ahead, draw = [], threading.Event(), render_path.render
+
+    def counted(*given, **options):
+        drawn.append(0)
+        if len(drawn) == 4:
+            ahead.set()
+        return draw(*given, **options)
+
+    def encode(path: Path, frames: Iterator[np.ndarray], *_: int) -> None:
+        next(frames)
+        assert ahead.wait(60) and len(list(frames)) == 9
+        path.parent.mkdir(parents=True)
+        path.touch()
+
+    for name, change in (("render", counted), ("write_video", encode), ("pictures_at_once", lambda _: 2)):
+        monkeypatch.setattr(render_path, name, change)
+    run("--path", "ellipse", "--seconds", 1, "--fps", 10)
+
+
+@pytest.mark.parametrize("frames", [["--frames"], []], ids=["with frames", "without"])
+def test_an_interrupted_video_leaves_the_earlier_one_and_its_frames(run, out, tmp_path, monkeypatch, frames):
+    PATH.write(tmp_path / "a.json")
+    folder = run("--path", tmp_path / "a.json", "--fps", 5, "--frames")
+    before = {name: (folder / name).read_bytes() for name in written(folder)}
+    (folder / ".a.tmp").mkdir()
+    (folder / ".a.tmp" / "00099.png").touch()  # of a killed run
+    drawn, draw = [], render_path.render
+
+    def interrupted(*given, **options):
+        if len(drawn) == 40:  # of 51, beyond the first ones that are written at once
+            raise KeyboardInterrupt
+        return drawn.append(0) or draw(*given, **options)
+
+    monkeypatch.setattr(render_path, "render", interrupted)
+    words = ["--path", tmp_path / "a.json", "--fps", 50, *frames]
+    with pytest.raises(KeyboardInterrupt):
+        run(*words, "--size", 64, 48)
+    assert {name: (folder / name).read_bytes() for name in written(folder)} == before
+    assert sorted(path.name for path in folder.iterdir()) == ["a", "a.mp4"]
+    drawn[:] = [0] * 100
+    (folder / "a" / "notes.png").write_text("mine")  # so that the folder can not be renamed
+    run(*words, "--size", 64, 48)
+    names = [f"a/{number:05d}.png" for number in range(51 if frames else 0)]
+    assert written(folder) == ["a.mp4", *names, "a/notes.png"]
+    assert {read(folder / name).shape for name in names} <= {(48, 64, 3)}
 
 
 # What is refused

@@ -1,9 +1,12 @@
 """Videos of camera paths: options of render.py, the request that they describe, and its rendering."""
 
 import argparse
+import contextlib
 import math
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,7 +25,7 @@ from gaussian_renderer.camera_paths.keyframes import (
 from gaussian_renderer.camera_paths.video import find_ffmpeg, write_video
 from gaussian_renderer.free_view import free_view
 from gaussian_renderer.memory_errors import explain_memory_errors
-from groundwork.files.image_files import pictures_at_once, remove_leftovers, to_bytes, write_png
+from groundwork.files.image_files import pictures_at_once, replace_pictures, to_bytes, write_png
 from groundwork.host.progress import Bar, in_threads
 from scene.cameras import Camera
 from scene.scene import Scene
@@ -148,8 +151,8 @@ def render_path(
 
     scene: with a loaded model. pipe: the pipeline options. background: (3,) in [0, 1].
 
-    Files: MODEL/videos/ours_N/NAME.mp4 and MODEL/videos/ours_N/NAME/00000.png ...; frames of an earlier run are
-    removed. UserError if the path cannot be made of the scene's cameras, or if something cannot be written.
+    Files: MODEL/videos/ours_N/NAME.mp4 and MODEL/videos/ours_N/NAME/00000.png ...; at the end they take the place of
+    an earlier run's. UserError if the path cannot be made of the scene's cameras, or if something cannot be written.
     """
     from gaussian_renderer.camera_paths.poses import poses_of  # SciPy takes a while to import
 
@@ -162,8 +165,9 @@ def render_path(
     folder = Path(scene.model_path) / "videos" / f"ours_{scene.loaded_iter}"
     video, images = folder / f"{request.name}.mp4", folder / request.name
     remedy = "pass a smaller --size" if request.size else "lower --resolution (-r), or pass a smaller --size"
-    remove_leftovers(images, count if request.frames else 0)
+    coming = images.with_name(f".{request.name}.tmp")
 
+    @torch.no_grad()  # in whichever thread
     def draw(number: int) -> np.ndarray:
         pose = path.at(frame_moment(path, request.fps, number))
         view = free_view(width, height, math.radians(pose.fov), pose.position, pose.wxyz, background.device)
@@ -171,19 +175,31 @@ def render_path(
             drawn = render(view, scene.gaussians, pipe, background, want_depth=False, want_visibility=False)
             return to_bytes(drawn["render"]).numpy()
 
+    def draw_some(numbers: Sequence[int]) -> list[np.ndarray]:
+        drawn = list(map(draw, numbers))
+        if request.frames:
+            in_threads(write_png, drawn, [coming / f"{number:05d}.png" for number in numbers], disable=True)
+        return drawn
+
     def frames() -> Iterator[np.ndarray]:
         size = pictures_at_once(width * height)
-        with Bar(total=count, desc=f"Rendering {request.name}", unit="frame") as bar:
-            for first in range(0, count, size):
-                numbers = range(first, min(first + size, count))
-                drawn = list(map(draw, numbers))
-                if request.frames:
-                    in_threads(write_png, drawn, [images / f"{number:05d}.png" for number in numbers], disable=True)
+        parts = (range(first, min(first + size, count)) for first in range(0, count, size))
+        with ThreadPoolExecutor(1) as ahead, Bar(total=count, desc=f"Rendering {request.name}", unit="frame") as bar:
+            waiting = None
+            for part in (*parts, None):
+                drawn = waiting.result() if waiting else []
+                waiting = part and ahead.submit(draw_some, part)  # while those that are drawn are encoded
                 for pixels in drawn:
                     yield pixels
                     bar.update()
 
-    write_video(video, frames(), width, height, request.fps)
+    shutil.rmtree(coming, ignore_errors=True)  # of a killed run
+    try:
+        with contextlib.closing(frames()) as drawn:
+            write_video(video, drawn, width, height, request.fps)
+        replace_pictures(images, coming)
+    finally:
+        shutil.rmtree(coming, ignore_errors=True)
     seconds, size = count / request.fps, video.stat().st_size / 1e6
     print(f"{video}: {count} frames of {width} x {height}, {seconds:.2f} s, {size:.2f} MB")
     return video

@@ -112,6 +112,21 @@ def remove_leftovers(folder: Path, count: int) -> None:
             file.unlink()
 
 
+def replace_pictures(folder: Path, new: Path) -> None:
+    """Let the pictures of the folder `new`, which may be missing, take the place of the numbered PNGs of `folder`.
+
+    Other files stay. However this ends, the folder has no pictures of both.
+    """
+    remove_leftovers(folder, 0)
+    if new.is_dir():
+        try:
+            os.replace(new, folder)
+        except OSError:  # it has other files
+            for file in sorted(new.iterdir()):
+                with atomic_write(folder / file.name) as temporary:
+                    os.replace(file, temporary)
+
+
 def write_plane(path: str | os.PathLike, values: np.ndarray, largest: float | None = None) -> None:
     """Write values (H, W), at least 0, as a 16-bit PNG; whole or not at all.
 
