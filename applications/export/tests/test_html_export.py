@@ -5,6 +5,7 @@ import hashlib
 import json
 import math
 import re
+import zlib
 
 import numpy as np
 import pytest
@@ -159,3 +160,12 @@ def test_a_page_that_nobody_could_use_is_not_written(tmp_path, monkeypatch, view
     with pytest.raises(UserError, match=said):
         write_html(tmp_path / "page.html", balls(), views)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("count", [1, 1 << 20, (1 << 21) + 5])
+def test_pages_are_packed_in_pieces_of_one_member(count):
+    content = np.random.default_rng(count).integers(0, 9, count, np.uint8).tobytes()
+    packed = html._gzip(memoryview(content))
+    unpacker = zlib.decompressobj(31)
+    assert unpacker.decompress(packed) == content and unpacker.eof and not unpacker.unused_data
+    assert len(packed) < 1.01 * len(gzip.compress(content)) + 100
