@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
+from scene.epipolar import epipolar_angles, fit_matrices, is_ahead, matrix_angles, medians, turn
 from scene.rotation_only import rotation_error
 from scene.unmatched import find_cover, find_overlaps, places_of
 
@@ -25,6 +26,7 @@ _BEHIND = 0.7  # share of a pair's matches behind a photo, from which it contrad
 _HEARD = 100  # matches of a pair that count; or two photos that show nearly the same would outvote all others
 _SHARING = 10  # other photos of a photo, whose tracks are compared
 _ROUNDS = 3  # of reweighted least squares
+_AT_ONCE = 256  # pairs
 # Other pairs' focal lengths are not known well enough, or they show nothing of depth (COLMAP's configurations).
 _CALIBRATED = {
     int(kind)
@@ -113,7 +115,7 @@ def verdict(pairs: Sequence[Pair]) -> dict[str, Any]:
 
 
 def judge_pairs(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
-    """Judge the pairs of photos that COLMAP has matched by a model (`judge_pair`), and yield one Pair for each.
+    """Judge the pairs of photos that COLMAP has matched by a model (`judge_rays`), and yield one Pair for each.
 
     Pairs are skipped if one photo has no pose in the model, if their focal lengths are not known well enough or they
     show no depth (_CALIBRATED), or if they have fewer than FEWEST matches.
@@ -124,14 +126,14 @@ def judge_pairs(model: pycolmap.Reconstruction, path: str) -> Iterator[Pair]:
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     images = {one.image_id: posed[one.name] for one in database.read_all_images() if one.name in posed}
     rays = {number: _compute_rays(image.camera, database.read_keypoints(number)) for number, image in images.items()}
+    listed = []
     for number, geometry in zip(*database.read_two_view_geometries(), strict=True):
         first, second = pycolmap.pair_id_to_image_pair(number)
         if first in images and second in images and int(geometry.config) in _CALIBRATED:
             matches = geometry.inlier_matches
-            seen = rays[first][matches[:, 0]], rays[second][matches[:, 1]]
-            if pair := judge_pair(images[first], images[second], *seen):
-                yield pair
+            listed.append((images[first], images[second], rays[first][matches[:, 0]], rays[second][matches[:, 1]]))
     database.close()
+    yield from judge_rays(listed)
 
 
 def judge_pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
@@ -154,72 +156,64 @@ def judge_pairs_by_tracks(model: pycolmap.Reconstruction) -> Iterator[Pair]:
         for i, image in images.items()
         if seen[i]
     }
+    listed = []
     for first, second in sorted(chosen):
         both = sorted(seen[first].keys() & seen[second].keys())
         matched = (rays[i][[seen[i][number] for number in both]] for i in (first, second))
-        if pair := judge_pair(images[first], images[second], *matched):
-            yield pair
+        listed.append((images[first], images[second], *matched))
+    yield from judge_rays(listed)
 
 
-def judge_pair(one: pycolmap.Image, other: pycolmap.Image, rays: np.ndarray, seen: np.ndarray) -> Pair | None:
-    """Judge a pair of photos by their poses: a Pair, or None with fewer than FEWEST usable matches.
+def judge_rays(
+    listed: Sequence[tuple[pycolmap.Image, pycolmap.Image, np.ndarray, np.ndarray]],
+) -> Iterator[Pair]:
+    """Judge pairs by the poses of their photos; yield a Pair for each with FEWEST usable matches, in order.
 
-    rays, seen: unit rays (N, 3) of the matches in the first and in the other photo, each in its camera's frame; a match
-        whose ray is not finite is left out.
+    listed: two photos, and the unit rays (N, 3) of their matches in the first and in the other one, each in its
+    camera's frame; a match whose ray is not finite is left out.
     """
-    usable = np.isfinite(rays).all(1) & np.isfinite(seen).all(1)
-    rays, seen = rays[usable], seen[usable]
-    if len(rays) < FEWEST:
-        return None
-    moved = other.cam_from_world() * one.cam_from_world().inverse()
-    x, y, z = moved.translation / max(float(np.linalg.norm(moved.translation)), 1e-12)
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ moved.rotation.matrix()
-    scale = (_count_pixels_a_radian(one.camera) + _count_pixels_a_radian(other.camera)) / 2
-    errors = (float(np.median(error)) * scale for error in (angles(essential, rays, seen), own_angles(rays, seen)))
-    side = max(one.camera.width, one.camera.height)
-    behind = share_behind(moved.rotation.matrix(), np.array([x, y, z]), rays, seen)
-    return Pair(one.name, other.name, len(rays), *errors, side, behind)
+    kept = []
+    for one, other, *rays in listed:
+        usable = np.isfinite(rays).all((0, 2))
+        if usable.sum() >= FEWEST:
+            kept.append((one, other, *(part[usable] for part in rays)))
+    found: dict[int, Pair] = {}
+    order = sorted(range(len(kept)), key=lambda number: len(kept[number][2]))  # pairs of one size are judged together
+    for start in range(0, len(order), _AT_ONCE):
+        some = order[start : start + _AT_ONCE]
+        found.update(zip(some, _judge_some([kept[number] for number in some]), strict=True))
+    yield from (found[number] for number in range(len(kept)))
 
 
-def share_behind(rotation: np.ndarray, shift: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> float:
-    """Share of matches whose rays (N, 3) meet behind one of two cameras, as where their order along a path is turned.
-
-    rotation (3, 3), shift (3,): from the first camera to the second. An essential matrix has no such sign.
-    """
-    turned = rays @ rotation.T
-    apart = np.cross(turned, seen)
-    depths = (np.cross(seen, shift) * apart).sum(1), (np.cross(turned, shift) * apart).sum(1)  # times a square
-    return float(((depths[0] < 0) | (depths[1] < 0)).mean())
-
-
-def angles(essential: np.ndarray, rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Angles (N,), radians, by which unit rays (N, 3) miss an essential matrix (3, 3).
-
-    Sampson's first-order distance (Hartley and Zisserman, eq. 11.9), with derivatives on the unit sphere instead of the
-    image plane, so that it holds for fisheyes and panoramas, too.
-    """
-    across, back = rays @ essential.T, seen @ essential
-    missed = (seen * across).sum(1)
-    slope = (across**2).sum(1) + (back**2).sum(1) - missed**2 - (back * rays).sum(1) ** 2
-    return np.abs(missed) / np.sqrt(np.maximum(slope, 1e-24))
-
-
-def own_angles(rays: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """`angles` (N,) of the matrix that fits the rays best: the eight-point algorithm, robust by reweighting.
-
-    The matrix need not be essential: so a wrong lens shows, and a plane, which several matrices fit, does no harm.
-    """
-    # Spread over all directions by a change of axes, or the equations of a narrow view are nearly singular.
-    one, other = (np.linalg.inv(np.linalg.cholesky(ray.T @ ray / len(ray) + 1e-12 * np.eye(3))) for ray in (rays, seen))
-    rows = np.einsum("ni,nj->nij", seen @ other.T, rays @ one.T).reshape(len(rays), 9)
-    weights = error = np.ones(len(rays))
-    for _ in range(_ROUNDS):
-        matrix = other.T @ np.linalg.eigh((rows * weights[:, None]).T @ rows)[1][:, 0].reshape(3, 3) @ one
-        error = angles(matrix, rays, seen)
-        slope = ((rays @ matrix.T) ** 2).sum(1) + ((seen @ matrix) ** 2).sum(1)
-        usual = max(1.5 * float(np.median(error)), 1e-12)
-        weights = 1 / ((1 + (error / usual) ** 2) * np.maximum(slope, 1e-18))
-    return error
+def _judge_some(pairs: Sequence[tuple[pycolmap.Image, pycolmap.Image, np.ndarray, np.ndarray]]) -> list[Pair]:
+    most = max(len(rays) for _, _, rays, _ in pairs)
+    rays, used = np.zeros((2, len(pairs), most, 3)), np.zeros((len(pairs), most))
+    turns, shifts, scales = np.zeros((len(pairs), 3, 3)), np.zeros((len(pairs), 3)), np.zeros(len(pairs))
+    for number, (one, other, *seen) in enumerate(pairs):
+        rays[:, number, : len(seen[0])] = seen
+        used[number, : len(seen[0])] = 1
+        moved = other.cam_from_world() * one.cam_from_world().inverse()
+        turns[number], shifts[number] = moved.rotation.matrix(), moved.translation
+        scales[number] = (_count_pixels_a_radian(one.camera) + _count_pixels_a_radian(other.camera)) / 2
+    shifts /= np.maximum(np.linalg.norm(shifts, axis=1, keepdims=True), 1e-12)
+    turned = turn(turns, rays[0])
+    errors = epipolar_angles(shifts[:, None], turned, rays[1])[0]
+    own = matrix_angles(fit_matrices(*rays, used, _ROUNDS), *rays)[0]
+    # An essential matrix has no sign that tells where rays meet.
+    behind = 1 - (is_ahead(shifts[:, None], turned, rays[1]) * used).sum(1) / used.sum(1)
+    numbers = zip(medians(np.abs(errors), used) * scales, medians(np.abs(own), used) * scales, behind, strict=True)
+    return [
+        Pair(
+            one.name,
+            other.name,
+            len(seen),
+            float(error),
+            float(best),
+            max(one.camera.width, one.camera.height),
+            float(share),
+        )
+        for (one, other, seen, _), (error, best, share) in zip(pairs, numbers, strict=True)
+    ]
 
 
 def consistent_groups(pairs: Iterable[tuple[Any, Any, float]]) -> list[list[Any]]:

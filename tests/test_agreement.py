@@ -15,6 +15,7 @@ from applications.convert import mapping
 from applications.convert.checks import is_wrong
 from scene import agreement
 from scene.checks.fit import check_agreement
+from scene.epipolar import epipolar_angles, matrix_angles
 from utils.system_utils import UserError
 
 COUNT, POINTS = 12, 200
@@ -59,7 +60,10 @@ def test_angles_are_the_least_by_which_both_rays_must_turn():
         )
         return second @ essential @ first
 
-    for one, other, found in zip(rays, seen, agreement.angles(essential, rays, seen), strict=True):
+    angles = np.abs(matrix_angles(essential[None], rays[None], seen[None])[0][0])
+    shift = np.array([1.0, 0.2, 0.3]) / np.linalg.norm([1.0, 0.2, 0.3])
+    np.testing.assert_allclose(np.abs(epipolar_angles(shift, rays, seen)[0]), angles, rtol=1e-9)
+    for one, other, found in zip(rays, seen, angles, strict=True):
         met = {"type": "eq", "fun": turned, "args": (one, other)}
         best = minimize(lambda by: by @ by, np.full(6, 1e-4), constraints=[met], tol=1e-14)
         assert best.success and found == pytest.approx(np.sqrt(best.fun), rel=0.01)
@@ -98,9 +102,8 @@ def test_an_order_that_is_turned_contradicts_though_its_epipolar_planes_fit():
     rays = [
         _unit(np.asarray(model.cameras[1].cam_ray_from_img(np.array([p.xy for p in i.points2D])))) for i in (one, other)
     ]
-    moved = other.cam_from_world() * one.cam_from_world().inverse()
-    assert agreement.share_behind(moved.rotation.matrix(), moved.translation, *rays) == 0
-    assert agreement.share_behind(moved.rotation.matrix(), -moved.translation, *rays) == 1
+    assert [pair.behind for pair in agreement.judge_rays([(one, other, *rays)])] == [0]
+    assert [pair.behind for pair in agreement.judge_rays([(one, other, *(-part for part in rays))])] == [1]
     assert _pair("a", "b")._replace(behind=0.9).contradicts and not _pair("a", "b")._replace(behind=0.5).contradicts
 
 

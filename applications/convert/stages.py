@@ -216,7 +216,7 @@ def reconstruction_stages(backend: Backend, masks: bool) -> list[Stage]:
                 "or name the lens that took them with --camera"
             )
 
-    mapped = layout.models, layout.tried, layout.judged, layout.calibrated
+    mapped = layout.models, layout.tried, layout.judged, layout.calibrated, layout.calibrated.with_suffix(".npz")
     files = [layout.database.with_name(layout.database.name + end) for end in ("", "-wal", "-shm", "-journal")]
     features_from = [backend.identity, settings.camera, settings.cameras, settings.max_num_features, settings.no_gpu]
     if settings.mapper == colmap.ADDING:

@@ -12,10 +12,10 @@ import pycolmap
 
 from applications.convert.global_sfm.matches import Matches, read_matches
 from applications.convert.global_sfm.model import make_model, make_views, read_views
+from applications.convert.global_sfm.pairs import read_poses
 from applications.convert.global_sfm.positions import place
 from applications.convert.global_sfm.relative_poses import (
-    epipolar_angles,
-    relative_poses,
+    RelativePoses,
 )
 from applications.convert.global_sfm.resection import keep_consistent, median_of_pairs, resect
 from applications.convert.global_sfm.rotations import average_rotations, rotation_vectors
@@ -28,6 +28,7 @@ from applications.convert.global_sfm.tracks import (
     epipolar_errors,
     triangulate,
 )
+from scene.epipolar import epipolar_angles
 
 _AHEAD, _KNOWN = 0.9, np.radians(2.0)  # of a pair whose rotation counts: matches before both cameras, spread
 _TURNED = np.radians(3.0)  # a pair whose rotation is off by more, and by more than three spreads, contradicts
@@ -68,11 +69,12 @@ class _Rotations(NamedTuple):
 def map_globally(path: str, calibrated: str, photos: str, threads: int) -> list[pycolmap.Reconstruction]:
     """Make a model of each set of photos that pairs connect, the largest first.
 
-    path: of a database. calibrated: of a copy with calibrated focal lengths; its matches are not asked, as it lacks
-    those that do not fit their pair's pose, which may be wrong. photos: folder, from which points take their colours.
-    threads: of the adjustments; -1: all cores.
+    path: of a database. calibrated: of a copy with calibrated focal lengths, of which `pose_pairs` was called. Its
+    matches are not asked, as it lacks those that do not fit their pair's pose, which may be wrong. photos: folder, from
+    which points take their colours. threads: of the adjustments; -1: all cores.
     """
-    mapper = _Mapper(replace(read_matches(path)[0], cameras=read_matches(calibrated)[0].cameras), threads)
+    matches = replace(read_matches(path)[0], cameras=read_matches(calibrated)[0].cameras)
+    mapper = _Mapper(matches, read_poses(calibrated), threads)
     left, models = np.ones(len(mapper.matches.images), bool), []
     while left.any() and (model := mapper.run(left)):
         model.extract_colors_for_all_images(photos)
@@ -83,11 +85,10 @@ def map_globally(path: str, calibrated: str, photos: str, threads: int) -> list[
 class _Mapper:
     """Places sets of photos."""
 
-    def __init__(self, matches: Matches, threads: int) -> None:
-        self.matches, self._threads = matches, threads
+    def __init__(self, matches: Matches, poses: RelativePoses, threads: int) -> None:
+        self.matches, self._poses, self._threads = matches, poses, threads
         self._rays = matches.rays(matches.cameras)
         seen = self._rays[matches.features].swapaxes(0, 1)
-        self._poses = relative_poses(matches.pair, *seen)
         turned = (self._poses.rotations[matches.pair] @ seen[0][..., None])[..., 0]
         self._errors = np.abs(epipolar_angles(self._poses.directions[matches.pair], turned, seen[1])[0])
         self._own_errors = median_of_pairs(matches, self._errors)

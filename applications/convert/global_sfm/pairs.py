@@ -1,11 +1,17 @@
 """Poses of the pairs of a COLMAP database, once focal lengths are calibrated."""
 
+from pathlib import Path
+
 import numpy as np
 import pycolmap
 
 from applications.convert.database import opened
 from applications.convert.global_sfm.matches import read_matches
-from applications.convert.global_sfm.relative_poses import epipolar_angles, is_ahead, relative_poses
+from applications.convert.global_sfm.relative_poses import (
+    RelativePoses,
+    relative_poses,
+)
+from scene.epipolar import epipolar_angles, is_ahead
 
 _FITTING = 1.0  # pixels; COLMAP's limits for calibrated pairs, in matches, too:
 _FEWEST, _SHARE = 30, 0.25
@@ -19,8 +25,6 @@ def pose_pairs(path: str) -> None:
     Pairs with too few that fit before both cameras, or without a certain rotation, are called degenerate.
     """
     matches, geometries = read_matches(path)
-    if not len(matches.pairs):
-        return
     seen = matches.rays(matches.cameras)[matches.features].swapaxes(0, 1)
     poses = relative_poses(matches.pair, *seen)
     turned, shift = (poses.rotations[matches.pair] @ seen[0][..., None])[..., 0], poses.directions[matches.pair]
@@ -45,3 +49,14 @@ def pose_pairs(path: str) -> None:
             one, other = (matches.images[photo].image_id for photo in matches.pairs[number])
             database.update_two_view_geometry(one, other, geometry)
     database.close()
+    np.savez(_find_record(path), *poses)
+
+
+def read_poses(path: str) -> RelativePoses:
+    """Read the poses of all pairs that `pose_pairs` found for a database, also of those it calls degenerate."""
+    with np.load(_find_record(path)) as record:
+        return RelativePoses(*record.values())
+
+
+def _find_record(path: str) -> Path:
+    return Path(path).with_suffix(".npz")

@@ -9,6 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from scene.epipolar import epipolar_angles, fit_matrices, is_ahead, medians, turn
+
 SAMPLED = 100  # matches of a pair that are asked
 _AT_ONCE = 4000  # pairs, so that memory is bounded
 _FITS, _STEPS = 4, 5
@@ -42,32 +44,13 @@ def relative_poses(pair: np.ndarray, one: np.ndarray, other: np.ndarray) -> Rela
     column = np.arange(SAMPLED)
     # Of each pair the same number of matches, evenly; those beyond its own number have no weight.
     rows = starts[:, None] + np.minimum(column * counts[:, None] // taken[:, None], counts[:, None] - 1)
-    parts = []
+    parts = [RelativePoses(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))]
     for start in range(0, len(counts), _AT_ONCE):
         some = rows[start : start + _AT_ONCE]
         used = (column < taken[start : start + _AT_ONCE, None]) & one[some].any(-1) & other[some].any(-1)
+        used[:, 0] |= ~used.any(1)  # a pair without rays is as good as one with a single match
         parts.append(_pose_pairs(one[some], other[some], used.astype(float)))
     return RelativePoses(*map(np.concatenate, zip(*parts, strict=True)))
-
-
-def epipolar_angles(shift: np.ndarray, one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return signed angles (...), radians, by which unit rays (..., 3) in one frame miss each other, and their slopes.
-
-    Sampson's distance on the unit sphere, as in `angles` of scene/agreement.py; the slope divides the algebraic error.
-
-    shift (..., 3): unit vector from the second camera to the first.
-    """
-    across = np.cross(shift, one)
-    missed = (other * across).sum(-1)
-    square = (across**2).sum(-1) + (np.cross(shift, other) ** 2).sum(-1) - 2 * missed**2
-    slope = np.sqrt(np.maximum(square, 1e-24))
-    return missed / slope, slope
-
-
-def is_ahead(shift: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Tell which rays meet before both cameras; all as in `epipolar_angles`."""
-    apart = np.cross(one, other)
-    return ((np.cross(other, shift) * apart).sum(-1) > 0) & ((np.cross(one, shift) * apart).sum(-1) > 0)
 
 
 def cross_matrix(vectors: np.ndarray) -> np.ndarray:
@@ -85,7 +68,7 @@ def rotate_by(vectors: np.ndarray) -> np.ndarray:
 
 
 def _pose_pairs(one: np.ndarray, other: np.ndarray, used: np.ndarray) -> tuple[np.ndarray, ...]:
-    rotation, direction = _choose_pose(_fit_matrices(one, other, used), one, other, used)
+    rotation, direction = _choose_pose(fit_matrices(one, other, used, _FITS), one, other, used)
     damping = np.full(len(one), 1e-3)
     error, slope = epipolar_angles(direction[:, None], turn(rotation, one), other)
     width = _error_widths(error, used)
@@ -110,26 +93,6 @@ def _pose_pairs(one: np.ndarray, other: np.ndarray, used: np.ndarray) -> tuple[n
     return rotation, direction, spread, _share_ahead(direction, turn(rotation, one), other, used)
 
 
-def _fit_matrices(one: np.ndarray, other: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Fit a matrix (P, 3, 3) to the rays of each pair, as `own_angles` of scene/agreement.py does for one pair."""
-    spread = [_whiten(rays, used) for rays in (one, other)]
-    first, second = one @ spread[0].swapaxes(1, 2), other @ spread[1].swapaxes(1, 2)
-    rows = (second[..., :, None] * first[..., None, :]).reshape(*one.shape[:2], 9)
-    weight, matrix = used, np.zeros((len(one), 3, 3))
-    for _ in range(_FITS):
-        least = np.linalg.eigh(rows.swapaxes(1, 2) @ (rows * weight[..., None]))[1][..., 0]
-        matrix = spread[1].swapaxes(1, 2) @ least.reshape(-1, 3, 3) @ spread[0]
-        error, slope = _matrix_angles(matrix, one, other)
-        weight = used / ((1 + (error / (0.75 * _error_widths(error, used))) ** 2) * np.maximum(slope**2, 1e-18))
-    return matrix
-
-
-def _whiten(rays: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Return the change of axes (P, 3, 3) that spreads the rays of a pair over all directions."""
-    moments = rays.swapaxes(1, 2) @ (rays * used[..., None]) / np.maximum(used.sum(1), 1)[:, None, None]
-    return np.linalg.inv(np.linalg.cholesky(moments + 1e-12 * np.eye(3)))
-
-
 def _choose_pose(
     matrix: np.ndarray, one: np.ndarray, other: np.ndarray, used: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -145,31 +108,14 @@ def _choose_pose(
     return rotation, direction
 
 
-def turn(rotation: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """Turn the rays (P, N, 3) of each pair by its rotation (P, 3, 3)."""
-    return rays @ rotation.swapaxes(1, 2)
-
-
 def _share_ahead(direction: np.ndarray, one: np.ndarray, other: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return for each pair the share of matches (P, N, 3) that meet before both cameras; used (P, N): weights."""
     return (is_ahead(direction[:, None], one, other) & (used > 0)).sum(1) / np.maximum(used.sum(1), 1)
 
 
-def _matrix_angles(matrix: np.ndarray, one: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what `epipolar_angles` does for matrices (P, 3, 3) that need not be essential."""
-    across, back = turn(matrix, one), other @ matrix
-    missed = (other * across).sum(-1)
-    square = (across**2).sum(-1) + (back**2).sum(-1) - missed**2 - (back * one).sum(-1) ** 2
-    slope = np.sqrt(np.maximum(square, 1e-24))
-    return missed / slope, slope
-
-
 def _error_widths(error: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Return twice the median (P, 1) of the absolute errors (P, N) that count."""
-    ordered = np.sort(np.where(used > 0, np.abs(error), np.inf), axis=1)
-    middle = np.minimum(used.sum(1).astype(int) // 2, error.shape[1] - 1)
-    found = ordered[np.arange(len(error)), middle]
-    return np.maximum(2 * np.where(np.isfinite(found), found, 1.0), _LEAST)[:, None]
+    return np.maximum(2 * medians(np.abs(error), used), _LEAST)[:, None]
 
 
 def _cauchy_loss(error: np.ndarray, width: np.ndarray, used: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import scipy.sparse
 from scipy.sparse.csgraph import connected_components
 
 from applications.convert.global_sfm.matches import Matches
-from applications.convert.global_sfm.relative_poses import epipolar_angles, is_ahead
+from scene.epipolar import epipolar_angles, is_ahead
 
 _FEWEST = 8  # matches of a pair that agree with the poses, and
 _SHARE = 0.3  # share of them, else none of the pair is used
