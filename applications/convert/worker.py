@@ -24,7 +24,6 @@ import pycolmap
 
 from applications.convert import pairing
 from applications.convert.database import opened
-from applications.convert.global_sfm.mapper import map_globally
 from applications.convert.global_sfm.pairs import pose_pairs
 from applications.convert.reduced import ABOUT, ENLARGED, FEW, choose_longest_side, read_enlarged, reduce_photos
 from scene.agreement import judge
@@ -156,6 +155,8 @@ def mapping(job: dict[str, Any]) -> None:
     way, photos = job["mapper"], _choose_photo_folder(job)
     database = job["database" if way == "free" else "calibrated"]
     if way == "direct":
+        from applications.convert.global_sfm.mapper import map_globally  # with SciPy, which no other step needs
+
         for number, model in enumerate(map_globally(job["database"], database, photos, THREADS)):
             folder = Path(job["models"], str(number))
             folder.mkdir()

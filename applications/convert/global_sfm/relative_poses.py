@@ -5,14 +5,16 @@ Zisserman, 9.6). Gauss-Newton steps then reduce Sampson's angles under Cauchy's 
 well the rotation is known: a pair without parallax, or of a plane, has a wide one.
 """
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 
+from groundwork.host.machine import threads
 from scene.epipolar import epipolar_angles, fit_matrices, is_ahead, medians, turn
 
 SAMPLED = 100  # matches of a pair that are asked
-_AT_ONCE = 4000  # pairs, so that memory is bounded
+_AT_ONCE = 250  # pairs of a thread, so that memory is bounded
 _FITS, _STEPS = 4, 5
 _LEAST = 1e-5  # radians: no match is more exact
 
@@ -44,12 +46,16 @@ def relative_poses(pair: np.ndarray, one: np.ndarray, other: np.ndarray) -> Rela
     column = np.arange(SAMPLED)
     # Of each pair the same number of matches, evenly; those beyond its own number have no weight.
     rows = starts[:, None] + np.minimum(column * counts[:, None] // taken[:, None], counts[:, None] - 1)
-    parts = [RelativePoses(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))]
-    for start in range(0, len(counts), _AT_ONCE):
+
+    def pose_some(start: int) -> tuple[np.ndarray, ...]:
         some = rows[start : start + _AT_ONCE]
         used = (column < taken[start : start + _AT_ONCE, None]) & one[some].any(-1) & other[some].any(-1)
         used[:, 0] |= ~used.any(1)  # a pair without rays is as good as one with a single match
-        parts.append(_pose_pairs(one[some], other[some], used.astype(float)))
+        return _pose_pairs(one[some], other[some], used.astype(float))
+
+    none = RelativePoses(np.zeros((0, 3, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    with ThreadPoolExecutor(threads()) as pool:
+        parts = [none, *pool.map(pose_some, range(0, len(counts), _AT_ONCE))]
     return RelativePoses(*map(np.concatenate, zip(*parts, strict=True)))
 
 
