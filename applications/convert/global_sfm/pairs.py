@@ -34,10 +34,10 @@ def pose_pairs(path: str) -> None:
     counts = [np.bincount(matches.pair, some, len(geometries)) for some in (ahead, fits, np.ones(len(fits)))]
     is_sound = (counts[0] >= np.maximum(_FEWEST, _SHARE * counts[2])) & (counts[0] > _AHEAD * counts[1])
     is_sound &= poses.spreads < _KNOWN
-    cut = np.searchsorted(matches.pair, np.arange(1, len(geometries)))
+    kept_of = np.split(fits, np.searchsorted(matches.pair, np.arange(1, len(geometries))))[: len(geometries)]
     database = opened(path)
     with pycolmap.DatabaseTransaction(database):
-        for number, (geometry, kept) in enumerate(zip(geometries, np.split(fits, cut), strict=True)):
+        for number, (geometry, kept) in enumerate(zip(geometries, kept_of, strict=True)):
             if geometry.config != _KINDS.CALIBRATED:
                 continue
             if not is_sound[number]:
