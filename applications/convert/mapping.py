@@ -28,6 +28,7 @@ from groundwork.files.json_files import read_json, write_json
 from utils.system_utils import UserError
 
 AGREEING = 0.9  # share of the photos that pairs bind, which agree in a model that is kept at once
+_FEW = 20  # photos, which incremental mapping takes two seconds for
 _FOLDED = 2  # ways that fold a scene, after which no other is tried
 _NAMES = {
     "direct": "direct global mapping",
@@ -51,10 +52,7 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
     except UserError as error:  # some ways do without
         print(f"warning: focal lengths could not be estimated: {error}", file=sys.stderr)
     tried: list[dict[str, Any]] = []
-    ways = list(backend.ways)
-    if count_rows(layout.database, "images") <= ALL_PAIRS and {"global", "incremental"} <= {*ways}:
-        ways.remove("global")  # the incremental way takes no longer for so few, and more often succeeds
-        ways.insert(ways.index("incremental") + 1, "global")
+    ways = _order_ways(backend.ways, count_rows(layout.database, "images"))
     while ways:
         way = ways.pop(0)
         title = "Mapping" if not tried else f"Mapping, try {len(tried) + 1}"
@@ -84,6 +82,12 @@ def map_photos(backend: Backend, run: Callable[..., None], place: Callable[[str,
         left = {**best["left"], "photos": best["photos"] - len(best["against"]), "alike": [], "alike_pair": None}
         best |= {**left, "against": best["against"]}
     write_json(layout.judged, [{name: value for name, value in one.items() if name != "left"} for one in tried])
+
+
+def _order_ways(ways: Sequence[str], count: int) -> list[str]:
+    """Order the ways of mapping for `count` photos: where they are few, the incremental one succeeds more often."""
+    first = {"incremental"} if count <= _FEW else {"direct", "grown", "incremental"} if count <= ALL_PAIRS else ()
+    return sorted(ways, key=lambda way: way not in first)
 
 
 def is_accepted(found: Mapping[str, Any]) -> bool:

@@ -34,8 +34,10 @@ _AHEAD, _KNOWN = 0.9, np.radians(2.0)  # of a pair whose rotation counts: matche
 _TURNED = np.radians(3.0)  # a pair whose rotation is off by more, and by more than three spreads, contradicts
 _FITTING = 2.0  # pixels from a pair's own pose, of matches that make the first tracks
 _FEWEST_SEEN, _LEAST = 15, 3  # points of a photo that is placed; photos of a model
-_FEW, _MANY = 100, 150  # tracks of a photo that poses come from
-_START, _BETWEEN = 8000, (50, 150)  # tracks of photos that first places come from, in all, and of a photo
+_FEW = 100  # tracks of a photo that poses come from
+# The same for the first places and the last poses: times photos, and the least and the most of a photo.
+_START, _START_EACH = 8000, (50, 150)
+_MANY, _MANY_EACH = 45000, (150, 600)
 _CLEAR = 0.125  # of a limit: a pair whose median error is below does not contradict
 _LAST = 4.0  # pixels from the matches' rays and points; COLMAP's limit, too
 
@@ -55,7 +57,7 @@ class _Round(NamedTuple):
 
 
 _FOCAL, _ALL = "focal length", "focal length and distortion"
-_ROUNDS = _Round(20, _FEW, 2, _FOCAL), _Round(8, _FEW, 1, _ALL), _Round(_LAST, _MANY, 1, _ALL, 3e-4)
+_ROUNDS = _Round(20, _FEW, 2, _FOCAL), _Round(8, _FEW, 1, _ALL)
 
 
 class _Rotations(NamedTuple):
@@ -119,8 +121,8 @@ class _Mapper:
     def _place(self, found: _Rotations) -> pycolmap.Reconstruction | None:
         """Return the model of a set of photos with rotations; None if fewer than three of them see points enough."""
         matches, views = self.matches, found.views
-        wanted = int(np.clip(_START // len(found.photos), *_BETWEEN))
-        tracks = choose_longest(matches, connect(matches, found.fits), wanted)
+        count = len(found.photos)
+        tracks = choose_longest(matches, connect(matches, found.fits), int(np.clip(_START // count, *_START_EACH)))
         photo = matches.photo[tracks.features]
         seen, camera = np.unique(photo, return_inverse=True)
         if len(seen) < _LEAST:
@@ -132,7 +134,8 @@ class _Mapper:
         views.posed[seen], views.places[seen] = True, places / size
         model = make_model(matches, matches.cameras, views, tracks, points / size)
         self._adjust(model, _Round(0))
-        for one in _ROUNDS:
+        last = _Round(_LAST, int(np.clip(_MANY // count, *_MANY_EACH)), 1, _ALL, 1e-4)
+        for one in (*_ROUNDS, last):
             model = self._triangulate(model, one)
             self._adjust(model, one)
         return _drop_unseen(self._triangulate(model, _Round(_LAST)))
