@@ -120,15 +120,19 @@ def test_a_track_with_two_features_of_a_photo_is_left_out(tmp_path):
     assert connect(matches, kept).count == whole.count - 2
 
 
-@pytest.mark.parametrize("lens", ["SIMPLE_RADIAL", "OPENCV_FISHEYE", "OPENCV"])
+LENSES = {
+    "SIMPLE_RADIAL": [1280.0, 512.0, 384.0, 0.05],
+    "OPENCV": [900.0, 900.0, 512.0, 384.0, -0.05, 0.02, 0.0, 0.0],
+    "OPENCV_FISHEYE": [500.0, 500.0, 512.0, 384.0, 0.02, -0.01, 0.0, 0.0],
+    "EQUIRECTANGULAR": [1024.0, 512.0],
+}
+
+
+@pytest.mark.parametrize("lens", LENSES)
 def test_a_scene_is_placed(tmp_path, lens):
-    params = {
-        "SIMPLE_RADIAL": [1280.0, 512.0, 384.0, 0.05],
-        "OPENCV_FISHEYE": [500.0, 500.0, 512.0, 384.0, 0.02, -0.01, 0.0, 0.0],
-        "OPENCV": [900.0, 900.0, 512.0, 384.0, -0.05, 0.02, 0.0, 0.0],
-    }[lens]
-    kind = getattr(pycolmap.CameraModelId, lens)
-    model, path = _scene(tmp_path, camera_model_id=kind, camera_params=params, camera_has_prior_focal_length=True)
+    size = {"camera_width": 1024, "camera_height": 512 if lens == "EQUIRECTANGULAR" else 768}
+    given = {"camera_model_id": getattr(pycolmap.CameraModelId, lens), "camera_params": LENSES[lens], **size}
+    model, path = _scene(tmp_path, camera_has_prior_focal_length=True, **given)
     found = _map(path, tmp_path, model)
     assert found.num_reg_images() == FRAMES and _errors(model, found).max() < 0.02
     assert found.compute_mean_reprojection_error() < 3 * PIXELS
