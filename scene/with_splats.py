@@ -77,6 +77,29 @@ def fill_model(gaussians: GaussianModel, splats: Splats) -> None:
     gaussians.active_sh_degree = min(gaussians.max_sh_degree, splats.sh_degree)
 
 
+def read_start(path: str | None, options: argparse.Namespace) -> tuple[argparse.Namespace, Splats | None]:
+    """Return model options whose init_pcd_path is a file's points, and its splats that are drawn, in the world.
+
+    The splats are None for a point cloud, whose path the options get, and without a file. UserError for a file without
+    splats that are drawn.
+    """
+    if not path:
+        return options, None
+    options = copy.copy(options)
+    if is_point_cloud(path):
+        options.init_pcd_path = path
+        return options, None
+    splats = splats_in(path)
+    splats = selected(splats, drawable(splats))
+    if not len(splats):
+        raise UserError(f"{path} has no Gaussians that are drawn; give another model")
+    points = splats.means.astype(np.float64) + splats.world_offset
+    colors = np.clip(base_colors(splats), 0, 1)
+    # The scene moves them into its frame, as it does any points.
+    options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
+    return options, splats
+
+
 def scene_with(
     path: str | None, options: argparse.Namespace, gaussians: GaussianModel, **of_scene: Any
 ) -> tuple[Scene, Splats | None]:
@@ -90,22 +113,10 @@ def scene_with(
     options: the model options.
     of_scene: further arguments of Scene.
     """
-    of_scene |= {"shuffle": False, "start": False}
-    if not path:
-        return Scene(options, gaussians, **of_scene), None
-    options = copy.copy(options)
-    if is_point_cloud(path):
-        options.init_pcd_path = path
-        return Scene(options, gaussians, **of_scene), None
-    splats = splats_in(path)
-    splats = selected(splats, drawable(splats))
-    if not len(splats):
-        raise UserError(f"{path} has no Gaussians that are drawn; give another model")
-    points = splats.means.astype(np.float64) + splats.world_offset
-    colors = np.clip(base_colors(splats), 0, 1)
-    # The scene moves them into its frame, as it does any points.
-    options.init_pcd_path = BasicPointCloud(points, colors, np.zeros_like(colors))
-    scene = Scene(options, gaussians, **of_scene)
+    options, splats = read_start(path, options)
+    scene = Scene(options, gaussians, shuffle=False, start=False, **of_scene)
+    if splats is None:
+        return scene, None
     if splats.enlargement != 1:  # as the file says, which is that of its training
         gaussians.enlargement = splats.enlargement
     means = np.ascontiguousarray(scene.info.point_cloud.points, dtype=np.float32)

@@ -141,6 +141,21 @@ def newest_checkpoint(folder: str, below: float = float("inf"), since: float | N
     return str(found[max(found)]) if found else None
 
 
+def refuse_other_scene(dataset: argparse.Namespace, checkpoint: str | None) -> None:
+    """Refuse a folder with a model of another scene (UserError), unless the checkpoint to resume lies in it.
+
+    dataset: the model options.
+    """
+    if not dataset.model_path:
+        return
+    folder = Path(dataset.model_path)
+    trained_on = str(_read_options(folder).get("source_path", ""))
+    if not lies_in(checkpoint, folder) and saves_in(folder) and other_scene(trained_on, dataset.source_path):
+        raise UserError(
+            f"{folder} holds a model of another scene, {trained_on}; name another folder with -m, or remove that one"
+        )
+
+
 def check_folder(
     now: argparse.Namespace,
     saving_iterations: Sequence[int],
@@ -148,7 +163,7 @@ def check_folder(
     first_iteration: int,
     checkpoint_iterations: Sequence[int] = (),
 ) -> None:
-    """Refuse a folder with a model of another scene, or with saves that this training's options do not fit (UserError).
+    """Refuse a folder with saves that this training's options do not fit (UserError).
 
     Warn of iterations that an earlier training has saved and this one does not overwrite. Programs that read these
     saves take the options of the folder, which are those of the last training.
@@ -157,11 +172,6 @@ def check_folder(
     """
     folder = Path(now.model_path)
     saved, then = saves_in(folder), _read_options(folder)
-    trained_on = str(then.get("source_path", ""))
-    if not lies_in(checkpoint, folder) and saved and other_scene(trained_on, now.source_path):
-        raise UserError(
-            f"{folder} holds a model of another scene, {trained_on}; name another folder with -m, or remove that one"
-        )
     new = {".ply": saving_iterations, ".pth": (*saving_iterations, *checkpoint_iterations)}
     stay = [n for n, path in saved.items() if n > first_iteration and n not in new[path.suffix]]
     if not stay:

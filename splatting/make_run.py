@@ -1,37 +1,30 @@
 """Make a training run of options: scene, model and density control, all checked before a file is written."""
 
 import argparse
-import copy
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 from gaussian_renderer.rays import check_views
-from groundwork.ranks.ranks import ranks
 from scene.checks.scene import check_scene
 from scene.fused_adam import FusedAdam
-from scene.gaussian_model import GaussianModel
 from scene.gaussians.adam import GaussianAdam
-from scene.gaussians.checkpoint import extra_state, load_checkpoint
 from scene.gaussians.morton import sort_rows
 from scene.sleeping import Sleeping, saves_time
 from scene.splats.splats import Splats
 from scene.with_splats import scene_with, start_from
 from splatting import folder
 from splatting.agreement import agree_on_scene
-from splatting.checks import check_alone, check_native, check_viewer, warnings_of
+from splatting.checks import check_native, warnings_of
 from splatting.iteration import ViewOrder
 from splatting.objective import Objective
-from splatting.part import Part, Strategy
-from splatting.registry import check_together, chosen, in_order, states_in, strategies, strategy_part
+from splatting.part import Strategy
+from splatting.plan import plan_run
+from splatting.registry import check_together, in_order, strategies, strategy_part
 from splatting.resume import warn_of_finished
 from splatting.resume_photos import order_views
 from splatting.run import Run, join_options
 from splatting.save import Checkpoints
-from splatting.schedule import Schedule
-from splatting.spill import make_storage
 from splatting.watch import DivergenceWatch, check_drawn
-from utils.system_utils import UserError, compute_device
 
 
 def make_run(
@@ -41,27 +34,9 @@ def make_run(
 
     launch: the options of arguments/launch.py.
     """
-    given, opt = opt, copy.copy(opt)  # of which the strategy, and windows by the clock, are decided here
-    group, device = ranks(), compute_device()
-    check_alone(pipe, launch, group.several)
-    start = group.broadcast_object(folder.resumed(launch.start_checkpoint, dataset.model_path, opt.iterations))
     check_native(dataset)  # before auto becomes native
-    dataset = folder.resolve_lenses(dataset, start)
-    if opt.strategy == "auto" and start:
-        opt.strategy = folder.strategy_of(start)
-    gaussians = GaussianModel(dataset.sh_degree, opt.optimizer_type)
-    # A large model fits on the device only once, or in part; of several processes, each keeps its part there.
-    capture, done = load_checkpoint(start, mapped=group.several) if start else (None, 0)
-    states = states_in(extra_state(capture)) if capture else {}
-    parts = chosen(together := join_options(launch, dataset, opt, pipe), states, done)
-    check_together(parts, together, group.several)
-    schedule = _make_schedule(parts, opt, start, done, states)
-    gaussians.storage = make_storage(gaussians, opt, device, any(one.takes_absolute(opt) for one in strategies()))
-    check_viewer(launch)
-    if schedule.is_over(done):
-        raise UserError(schedule.nothing_left_message(start, done))
-
-    init_ply = None if start else getattr(dataset, "init_ply", None)
+    given, plan = opt, plan_run(dataset, opt, pipe, launch)
+    dataset, opt, group, device, start, capture, done, states, parts, schedule, gaussians, init_ply = plan
     scene, splats = scene_with(init_ply, dataset, gaussians, ranks=group, parts=parts)
     gaussians.enlargement = folder.enlargement_of(start, gaussians.enlargement)
     check_scene(scene, dataset, bool(start))
@@ -89,23 +64,6 @@ def make_run(
     warn_of_finished(run)
     run.watch, run.checkpoints = DivergenceWatch(run), Checkpoints(run)
     return run
-
-
-def _make_schedule(
-    parts: Sequence[Part], opt: argparse.Namespace, start: str | None, done: int, states: dict[str, Any]
-) -> Schedule:
-    """Return the schedule of a part, or the steady one.
-
-    A paced run has few iterations, and needs the last ones to train the Gaussians that it has. So densification ends by
-    default at a part of the schedule, where it would end with the schedule.
-    """
-    found = [part.make_schedule(opt, start, done, states.get(part.name)) for part in parts]
-    schedule = next(filter(None, found), None) or Schedule(opt.iterations)
-    if schedule.paced:
-        for name, share in {strategy.until for strategy in strategies()}:
-            if getattr(opt, name) >= opt.iterations:
-                setattr(opt, name, int(share * opt.iterations))
-    return schedule
 
 
 def _begin_model(run: Run, capture: tuple | None, splats: Splats | None, states: dict[str, Any]) -> None:

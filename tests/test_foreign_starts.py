@@ -213,6 +213,21 @@ def test_render_draws_a_file_in_the_views_of_a_scene(tmp_path, colmap_scene, mon
     assert '"antialiasing": true' in (out / "test/ours_theirs/render_times.json").read_text()
 
 
+@pytest.mark.parametrize("trained", [True, False])
+def test_only_a_model_is_said_to_be_trained_without_eval(tmp_path, colmap_scene, monkeypatch, capsys, trained):
+    path, out = tmp_path / "theirs.ply", tmp_path / "out"
+    find_format(path).write(path, splats(20, 1))
+    if trained:
+        _train(colmap_scene, out, "--init_ply", path)
+    words = {"the model was trained without --eval": [], "--eval holds some out": ["--ply", path]}
+    for said, more in words.items():
+        if more or trained:
+            argv = ["render.py", "-s", colmap_scene, "-m", out, "--skip_train", *more]
+            monkeypatch.setattr("sys.argv", [str(word) for word in argv])
+            render.main()
+            assert f"test: no views; {said} [" in capsys.readouterr().out
+
+
 def test_export_chooses_what_it_writes(tmp_path, colmap_scene, capsys):
     out = tmp_path / "out"
     start = tmp_path / "start.ply"

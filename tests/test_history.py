@@ -19,7 +19,7 @@ from waiting import wait_for
 import train
 from arguments import add_to_model_json, read_model_json, write_cfg_args
 from groundwork.files.folders import remove_temporary_files
-from splatting.folder import check_folder, continue_records, own_folder, records_kept
+from splatting.folder import continue_records, own_folder, records_kept, refuse_other_scene
 from splatting.records.error_curve import COLUMNS, read_curve, write_curve
 from utils.system_utils import UserError, atomic_write
 
@@ -302,7 +302,7 @@ def test_what_a_folder_must_hold_to_be_refused(tmp_path, trained):
 
     def check(source: Path, checkpoint: Path | None = None) -> None:
         options = MODEL | {"source_path": str(source), "model_path": str(tmp_path)}
-        check_folder(argparse.Namespace(**options), [5], checkpoint and str(checkpoint), 5 if checkpoint else 0)
+        refuse_other_scene(argparse.Namespace(**options), checkpoint and str(checkpoint))
 
     scene, other = tmp_path / "scene", tmp_path / "other"
     scene.mkdir()

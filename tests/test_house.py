@@ -33,6 +33,7 @@ FLOORS = (
     ("splatting.loop",),
     ("splatting.faster", "splatting.log"),
     ("splatting.make_run",),
+    ("splatting.plan",),
     ("splatting.run",),
     ("splatting.checks",),
     ("splatting.registry",),

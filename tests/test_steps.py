@@ -26,6 +26,7 @@ from trainings import (
 
 from splatting import loop
 from splatting import make_run as making
+from splatting import plan as planning
 from splatting.faster import captured, faster_steps, speculative
 from splatting.faster.captured import CapturedStep
 from splatting.faster.faster import FasterSteps
@@ -152,14 +153,14 @@ TERMS = {
 @pytest.mark.parametrize(("ways", "late", "fused", "term"), TERMS.values(), ids=TERMS.keys())
 def test_a_term_that_was_added_is_not_lost(scene, tmp_path, without, monkeypatch, take_as, ways, late, fused, term):  # noqa: F811
     """Gradients past the image make the steps from there on plain; what asks for more than an image is not captured."""
-    call, make, models, calls = Objective.__call__, making.GaussianModel, [], []
+    call, make, models, calls = Objective.__call__, planning.GaussianModel, [], []
 
     def with_term(self, package, at):
         losses = call(self, package, at)
         calls.append(1)
         return losses if len(calls) <= late else losses._replace(total=term(losses, package, at, models[-1]._scaling))
 
-    monkeypatch.setattr(making, "GaussianModel", lambda *x: (models.append(make(*x)), calls.clear(), models[-1])[2])
+    monkeypatch.setattr(planning, "GaussianModel", lambda *x: (models.append(make(*x)), calls.clear(), models[-1])[2])
     monkeypatch.setattr(Objective, "__call__", with_term)
     take_as("plain")
     plain = trained_as("default", scene, tmp_path / "plain")

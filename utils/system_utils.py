@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from groundwork.files.writing import atomic_write, mkdir_p, temporary_folder, writes_files
+from groundwork.files.writing import atomic_write, check_folder_can_be_made, mkdir_p, temporary_folder, writes_files
 from groundwork.host import start, torchrun
 from groundwork.host.errors import UserError, first_line
 from groundwork.host.interrupt import Terminated, let_signals_end
@@ -19,6 +19,7 @@ __all__ = [
     "Terminated",
     "UserError",
     "atomic_write",
+    "check_folder_can_be_made",
     "compute_device",
     "find_iteration",
     "first_line",

@@ -41,6 +41,8 @@ def diagnose(source: str | None, images: str | None, model: str | None, iteratio
                 model = None
                 continue
             raise UserError(f"no folder {folder or repr(folder)}; pass an existing folder as {option}")
+    if masks and source is None:
+        raise UserError("--masks names mask files of a scene; give the scene as -s, or leave --masks out")
     if source is not None:
         from applications.doctor.advice import check_options
         from scene.checks.scene import check_dataset

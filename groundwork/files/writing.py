@@ -53,6 +53,17 @@ def mkdir_p(folder_path: str | os.PathLike) -> None:
         ) from error
 
 
+def check_folder_can_be_made(folder: str | os.PathLike) -> None:
+    """UserError where `mkdir_p` would raise one. Leaves no folder that was not there."""
+    made = [path for path in (Path(folder), *Path(folder).parents) if not path.exists()]
+    try:
+        mkdir_p(folder)
+    finally:
+        for path in made:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+
+
 @contextlib.contextmanager
 def temporary_folder() -> Iterator[Path]:
     """Yield a folder for temporary files, and delete it afterwards. UserError where none can be made."""

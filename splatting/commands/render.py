@@ -164,12 +164,14 @@ def render_set(
     planes: Collection[str] = (),
     points: Mapping[str, PointDepths] | None = None,
     scored: ScoredViews | None = None,
+    lacking: str = "",
 ) -> None:
     """Write renders, ground truth, masks and times of `views` under model_path/name/ours_ITERATION; print the time.
 
     train_test_exp: render with exposures, and write right halves only.
     separate_sh: accepted for callers of the reference; the SH bands are always passed separately.
     planes, points, scored: as for `write_views`.
+    lacking: why there may be no views.
     """
     folder = Path(model_path) / name / f"ours_{iteration}"
     for of_earlier in (TIMES, DEPTHS):  # of an interrupted run they do not count
@@ -177,7 +179,7 @@ def render_set(
     with explain_memory_errors(gaussians, views):
         seconds = write_views(folder, views, gaussians, pipeline, background, train_test_exp, planes, points, scored)
     if not seconds:
-        print(f"{name}: no views" + ("; the model was trained without --eval" if name == "test" else ""))
+        print(f"{name}: no views" + (f"; {lacking}" if lacking else ""))
         return
     sizes = [(view.image_width, view.image_height) for view in views]
     antialiasing = getattr(pipeline, "antialiasing", False)  # options of 2023 lack it
@@ -218,8 +220,11 @@ def render_sets(
     if not skip_train:
         render_set(scene.model_path, "train", scene.loaded_iter, scene.getTrainCameras(), *drawn, planes=planes)
     if not skip_test:
-        views = scene.getTestCameras()
-        render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, planes=planes, points=points)
+        views, lacking = scene.getTestCameras(), ""
+        if not dataset.eval:
+            lacking = "--eval holds some out" if ply else "the model was trained without --eval"
+        more = {"planes": planes, "points": points, "lacking": lacking}
+        render_set(scene.model_path, "test", scene.loaded_iter, views, *drawn, **more)
         beside = extra_test_views(scene, pipeline, background)
         for name in BESIDE:
             scored, shown = beside.get(name, (None, []))

@@ -15,18 +15,18 @@ from arguments import write_cfg_args, write_model_json
 from arguments.launch import launch_options, training_parser
 from groundwork.applications import application
 from scene.checks.conversion import awaits_conversion
-from scene.gaussians.checkpoint import load_checkpoint
 from scene.images.store import image_device
 from splatting.agreement import agree_on_options
 from splatting.events import summary_writer
 from splatting.folder import folder_of, new_folder, own_folder, records_kept, resolve_lenses
 from splatting.loop import run_training, standard_observers
 from splatting.make_run import make_run
+from splatting.plan import check_before_scene
 from splatting.registry import PARTS, check_together, chosen
 from splatting.resume import choose_checkpoint
 from splatting.scores import training_report
 from utils.general_utils import safe_state
-from utils.system_utils import UserError, compute_device, mkdir_p
+from utils.system_utils import UserError, check_folder_can_be_made, compute_device, mkdir_p
 
 __all__ = ["main", "parse", "prepare_output_and_logger", "train", "training", "training_report"]
 
@@ -38,8 +38,7 @@ def train(
 
     launch: the options of arguments/launch.py.
     """
-    stops = {option: continues for part in PARTS for option, continues in part.ends_by.items()}
-    if not choose_checkpoint(dataset, opt, launch, stops):
+    if not _has_more_to_train(dataset, opt, launch):
         return
     dataset.model_path = dataset.model_path or folder_of(launch.start_checkpoint) or new_folder(dataset.source_path)
     run = make_run(dataset, opt, pipe, launch)
@@ -102,20 +101,31 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, ...]:
     return args, *options
 
 
-def _check_places(dataset: argparse.Namespace, launch: argparse.Namespace) -> None:
-    """Refuse a model folder or a checkpoint (UserError), and name a device, that would fail after a conversion."""
+def _has_more_to_train(dataset: argparse.Namespace, opt: argparse.Namespace, launch: argparse.Namespace) -> bool:
+    """Choose the checkpoint of --resume. Return False where the training that it names is finished."""
+    stops = {option: continues for part in PARTS for option, continues in part.ends_by.items()}
+    return choose_checkpoint(dataset, opt, launch, stops)
+
+
+def _is_worth_converting(
+    dataset: argparse.Namespace, opt: argparse.Namespace, pipe: argparse.Namespace, launch: argparse.Namespace
+) -> bool:
+    """Refuse what a training would refuse after a conversion (UserError). Return False if there is nothing to train."""
     image_device(dataset.data_device, compute_device(), warn=True)
-    if launch.start_checkpoint:
-        load_checkpoint(launch.start_checkpoint, mapped=True)
+    if not _has_more_to_train(dataset, opt, launch):
+        return False
+    check_before_scene(dataset, opt, pipe, launch)
     if dataset.model_path:
-        mkdir_p(dataset.model_path)
+        check_folder_can_be_made(dataset.model_path)
+    return True
 
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Train as the command line says."""
     args, dataset, opt, pipe = parse(argv)
     if dataset.source_path and awaits_conversion(dataset.source_path):
-        _check_places(dataset, args)
+        if not _is_worth_converting(dataset, opt, pipe, args):
+            return
         application("convert", "command").convert_first(dataset.source_path)
     if args.advise or args.options == "auto":
         given = sys.argv[1:] if argv is None else argv

@@ -23,6 +23,7 @@ from applications.convert.layout import Layout, find_images, take_photos_beside
 from applications.convert.pairing import choose_first_pairs, compute_likeness, name_by_id, plan_rounds, restore_names
 from applications.convert.reduced import choose_longest_side, read_enlarged, reduce_photos
 from applications.convert.stages import Stage, StageRecord
+from arguments import write_cfg_args
 from scene.checks.conversion import describe_changed_photos, file_state, is_unfinished
 from scene.readers.scene_folder import REPORT, find_capture
 from utils.system_utils import UserError
@@ -211,17 +212,44 @@ def test_what_stands_in_the_way_is_named(tmp_path, monkeypatch, what, said):
     assert not (tmp_path / "distorted").exists()
 
 
-@pytest.mark.parametrize(
-    ("option", "path", "said"),
-    [("-m", "file/out", "cannot create the folder"), ("--start_checkpoint", "a.pth", "no checkpoint .*a.pth")],
-)
-def test_places_are_judged_before_a_conversion(tmp_path, monkeypatch, capsys, option, path, said):
+@pytest.mark.parametrize(("words", "said"), [
+    ("-m {}/file/out", "cannot create the folder"),
+    ("--start_checkpoint {}/a.pth", "no checkpoint .*a.pth"),
+    ("--init_ply {}/a.ply", "no file .*a.ply; give a model"),
+    ("--init_ply {}/cloud.ply", "cloud.ply is not a readable PLY"),
+    ("--init_pcd_path {}/a.ply", "no point cloud .*a.ply"),
+    ("--gpu_memory 4", "--gpu_memory limits the memory of a GPU, and there is none"),
+    ("--viewer 70000", "the page's port must be between 0"),
+    ("--paused", "--paused needs --viewer"),
+    ("--resume", "--resume needs -m"),
+    ("-m {}/of_other", "of_other holds a model of another scene"),
+])  # fmt: skip
+def test_what_a_training_refuses_is_refused_before_a_conversion(tmp_path, monkeypatch, capsys, words, said):
     monkeypatch.setattr(convert, "convert_first", lambda source: pytest.fail("converted"))
-    make_photos(tmp_path, 3)
+    make_photos(scene := tmp_path / "photos", 3)
     (tmp_path / "file").touch()
+    (tmp_path / "cloud.ply").write_text("ply\n")
+    saved = tmp_path / "of_other" / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    saved.parent.mkdir(parents=True)
+    saved.touch()
+    write_cfg_args(tmp_path / "of_other", SimpleNamespace(source_path=str(tmp_path)))
+    before = sorted(tmp_path.rglob("*"))
     with pytest.raises(UserError, match=said):
-        train.main(["-s", str(tmp_path), "--data_device", "cuda:9", option, str(tmp_path / path)])
-    assert "--data_device cuda:9 is not available" in capsys.readouterr().err
+        train.main(["-s", str(scene), "--data_device", "cuda:9", *words.replace("{}", str(tmp_path)).split()])
+    assert "--data_device cuda:9 is not available" in capsys.readouterr().err and sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_failed_conversion_leaves_no_model_folder(tmp_path, monkeypatch):
+    def fail(source: str) -> None:
+        raise UserError("photos without overlap")
+
+    monkeypatch.setattr(convert, "convert_first", fail)
+    make_photos(scene := tmp_path / "photos", 3)
+    (tmp_path / "there").mkdir()
+    for folder in ("new/out", "there"):
+        with pytest.raises(UserError, match="photos without overlap"):
+            train.main(["-s", str(scene), "-m", str(tmp_path / folder)])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "there"]
 
 
 def test_a_folder_that_is_read_only_is_named(tmp_path, monkeypatch):

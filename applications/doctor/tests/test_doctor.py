@@ -61,6 +61,8 @@ def test_exit_statuses(healthy, colmap_scene, capsys):
     for option, folder in (("-s", "nowhere"), ("-m", "")):
         with pytest.raises(UserError, match=f"no folder .*{folder}.*; pass an existing folder as {option}"):
             doctor.main([option, folder])
+    with pytest.raises(UserError, match="--masks names mask files of a scene; give the scene as -s"):
+        doctor.main(["--masks", "masks"])
     assert exit_status("-s", str(colmap_scene), "-m", "nowhere") == 1
     assert "no model in nowhere yet" in capsys.readouterr().out
 
