@@ -124,8 +124,13 @@ def info_from_record(record: Any, size: Size, is_nerf_synthetic: bool) -> Camera
 
 def call_either_form(function: Callable, newer: tuple, older: tuple) -> Any:
     """Call a function that may be other code's of 2023 and then takes the older, fewer arguments."""
+    return function(*(newer if takes(function, newer) else older))
+
+
+def takes(function: Callable, arguments: tuple) -> bool:
+    """Tell whether a function may be called with so many arguments."""
     try:
-        inspect.signature(function).bind(*newer)
+        inspect.signature(function).bind(*arguments)
     except TypeError:
-        return function(*older)
-    return function(*newer)
+        return False
+    return True

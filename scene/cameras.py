@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from scene.camera_forms import NOT_MOVED, SIGNATURE, call_either_form, info_from_record, parse_either_form
+from scene.camera_forms import NOT_MOVED, SIGNATURE, info_from_record, parse_either_form, takes
 from scene.images.sizes import training_size
 from scene.images.store import InMemory
 from scene.readers.info import CameraInfo, photo_size
@@ -290,8 +290,8 @@ def cameraList_from_camInfos(
 ) -> list[Camera]:
     """Call `loadCam`, or other code's replacement, for each view; uids count from 0."""
     load, of_2024 = find_replacement("loadCam") or loadCam, (is_nerf_synthetic, is_test_dataset)
-    older = [(args, uid, info, resolution_scale) for uid, info in enumerate(cam_infos)]
-    return [call_either_form(load, (*arguments, *of_2024), arguments) for arguments in older]
+    more = of_2024 if takes(load, (args, 0, None, resolution_scale, *of_2024)) else ()
+    return [load(args, uid, info, resolution_scale, *more) for uid, info in enumerate(cam_infos)]
 
 
 def camera_to_JSON(id: int, camera: CameraInfo) -> dict[str, object]:

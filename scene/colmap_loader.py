@@ -8,7 +8,10 @@ import functools
 import math
 import os
 import struct
-from collections.abc import Callable, Iterator, Sequence
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, TypeVar
 
@@ -20,6 +23,7 @@ from utils.system_utils import UserError, first_line
 StrPath = str | os.PathLike
 Record = TypeVar("Record")
 
+_ROW = np.dtype([("ids", "i8"), ("xyz", "f8", 3), ("rgb", "f8", 3), ("errors", "f8")])  # as Points, in a text file
 _ROUNDED = 1e-12  # departure of a quaternion's length from 1 that double precision leaves
 
 
@@ -207,17 +211,17 @@ def read_images(path: StrPath, binary: bool, with_points: bool = True) -> dict[i
 def read_points(path: StrPath, binary: bool) -> Points:
     """Points of a points3D file. UserError where two have one id, or where colours of a text range to 1."""
     file = _open_file(path, binary)
-    points, places = file.points()
+    points = file.points()
     order = np.argsort(points.ids, kind="stable")
     again = np.flatnonzero(np.diff(points.ids[order]) == 0)
     if len(again):
-        first, second = (places.of(place) for place in sorted(order[again[0] : again[0] + 2]))
+        first, second = (file.place_of(place) for place in sorted(order[again[0] : again[0] + 2]))
         raise _make_twice_error(file, first, second, f"the id {points.ids[order[again[0]]]}")
     part = (points.rgb % 1).any(axis=1)
     if part.any() and points.rgb.max() <= 1:
         first = part.argmax()
         raise UserError(
-            f"{places.of(first)} of {path} has the colour {' '.join(map(str, points.rgb[first]))}, but COLMAP's "
+            f"{file.place_of(first)} of {path} has the colour {' '.join(map(str, points.rgb[first]))}, but COLMAP's "
             "colours range from 0 to 255; multiply all colours in the file by 255"
         )
     return points
@@ -255,35 +259,25 @@ def _read_image(file: "_BinaryFile | _TextFile", with_points: bool) -> Image:
     return Image(id, np.array(pose[:4]), np.array(pose[4:]), camera_id, name, xys, ids)
 
 
-def _read_point(file: "_TextFile") -> tuple[int | float, ...]:
-    """Read id, position and colour of a 3D point. ValueError for numbers that are not finite or out of range."""
-    id, x, y, z, red, green, blue, _ = values = file.take("qddddddd")
+def _read_point(file: "_TextFile") -> tuple:
+    """Read a 3D point as a row of _ROW. ValueError for numbers that are not finite or out of range."""
+    id, x, y, z, red, green, blue, error = values = file.take("qddddddd")
     colored = 0 <= red <= 255 and 0 <= green <= 255 and 0 <= blue <= 255
     if not (math.isfinite(x + y + z) and colored) or id >> 63:
         raise ValueError(f"got {' '.join(map(str, values))}")
-    return tuple(values)  # many lists would keep the garbage collector busy
+    return id, (x, y, z), (red, green, blue), error
 
 
-def _table_of_points(rows: Sequence[Sequence[str | int | float]]) -> Points:
-    """The points of rows of id, x, y, z, red, green, blue and error. ValueError where `_read_point` refuses one."""
-    table = np.array(rows, dtype=np.float64) if rows else np.zeros((0, 8))
-    if table.shape[1:] != (8,):
-        raise ValueError("not eight numbers each")
-    ids = np.array([row[0] for row in rows], dtype=np.int64)  # not from the floats, which hold ids to 2^53 only
-    xyz, rgb = table[:, 1:4], table[:, 4:7]
-    if not (np.isfinite(xyz.sum(axis=1)).all() and ((rgb >= 0) & (rgb <= 255)).all() and (ids >= 0).all()):
+def _read_table(path: StrPath) -> np.ndarray:
+    """Read the points of a text file as rows _ROW. ValueError or a warning where `_read_point` might read others."""
+    with open(path, encoding=encoding_of(path)) as file, warnings.catch_warnings():
+        warnings.simplefilter("error")  # of an id with a decimal point, or of no points
+        rows = np.loadtxt(file, _ROW, usecols=range(8), ndmin=1)
+    rgb = rows["rgb"]
+    colored = ((rgb >= 0) & (rgb <= 255)).all()
+    if not (np.isfinite(rows["xyz"].sum(axis=1)).all() and colored and (rows["ids"] >= 0).all()):
         raise ValueError("not finite, or no colour")
-    return Points(ids, xyz, rgb, table[:, 7])
-
-
-class _Numbered(NamedTuple):
-    """Names of places in a file, made when they are asked for."""
-
-    what: str
-    numbers: Sequence[int]
-
-    def of(self, index: int) -> str:
-        return f"{self.what} {self.numbers[index]}"
+    return rows
 
 
 def _open_file(path: StrPath, binary: bool) -> "_BinaryFile | _TextFile":
@@ -293,7 +287,7 @@ def _open_file(path: StrPath, binary: bool) -> "_BinaryFile | _TextFile":
 class _BinaryFile:
     """The values of a binary file, taken in order; ValueError or struct.error where it is too short."""
 
-    _POINT = np.dtype([("id", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("seen", "<u8")])
+    _POINT = np.dtype([("ids", "<i8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("errors", "<f8"), ("seen", "<u8")])
     _TRACK = 8  # bytes for each photo that sees a point
     _POINT_2D = np.dtype([("xy", "<f8", 2), ("id", "<i8")])
 
@@ -347,8 +341,7 @@ class _BinaryFile:
         rows = np.frombuffer(self._content[begin : self._at] if needed else b"", self._POINT_2D)
         return rows["xy"].copy(), rows["id"].copy()
 
-    def points(self) -> tuple[Points, "_Numbered"]:
-        """The points, and the place of each."""
+    def points(self) -> Points:
         content, starts, count = self._content, [], 1
         number, record, length_at = struct.Struct("<Q"), self._POINT.itemsize, self._POINT.fields["seen"][1]
         at = number.size
@@ -366,7 +359,10 @@ class _BinaryFile:
         places = len(content) - self._POINT.itemsize + 1
         view = np.ndarray((places,), self._POINT, content, strides=(1,)) if starts else np.zeros(0, self._POINT)
         rows = view[starts]
-        return Points(rows["id"], rows["xyz"], rows["rgb"], rows["error"]), _Numbered("point", range(1, count + 1))
+        return Points(*(rows[name] for name in Points._fields))
+
+    def place_of(self, point: int) -> str:
+        return f"point {point + 1}"
 
     def _cut_short(self, what: str, number: int, count: int) -> UserError:
         fault = describe_wrong_file(self.path)
@@ -414,17 +410,16 @@ class _TextFile:
                     "fix it, or copy the file again"
                 ) from error
 
-    def points(self) -> tuple[Points, "_Numbered"]:
-        """The points, and the place of each."""
-        rows, numbers = [], []
-        for row in self.records("point", lambda file: file._rest.split(maxsplit=8)[:8]):
-            rows.append(row)
-            numbers.append(self._number)
+    def points(self) -> Points:
         try:
-            points = _table_of_points(rows)
-        except (ValueError, OverflowError):  # which one it is, they say one by one, which takes three times as long
-            points = _table_of_points(list(self.records("point", _read_point)))
-        return points, _Numbered("line", numbers)
+            rows = _read_table(self.path)
+        except (ValueError, Warning):  # which one it is, they say one by one, which takes ten times as long
+            rows = np.array(list(self.records("point", _read_point)), dtype=_ROW)
+        return Points(*(rows[name] for name in Points._fields))
+
+    def place_of(self, point: int) -> str:
+        deque(islice(self.records("point", lambda _: None), point + 1), maxlen=0)
+        return self.place
 
     def take(self, kinds: str) -> list[int | float]:
         """A value for each letter: a float for d, else an integer."""

@@ -92,15 +92,13 @@ def projection(
     fovX, fovY: opening angles in radians of a frustum of the image's size. offsetX, offsetY: principal point minus
     image centre in NDC (half image sizes), so 2 cx / W - 1 for COLMAP's cx, with pixel centres at .5.
     """
-    P = torch.zeros(4, 4, dtype=torch.float64)
-    P[0, 0] = 1 / math.tan(fovX / 2)
-    P[1, 1] = 1 / math.tan(fovY / 2)
-    P[0, 2] = offsetX
-    P[1, 2] = offsetY
-    P[2, 2] = zfar / (zfar - znear)
-    P[2, 3] = -zfar * znear / (zfar - znear)
-    P[3, 2] = 1
-    return P
+    rows = [
+        [1 / math.tan(fovX / 2), 0, offsetX, 0],
+        [0, 1 / math.tan(fovY / 2), offsetY, 0],
+        [0, 0, zfar / (zfar - znear), -zfar * znear / (zfar - znear)],
+        [0, 0, 1, 0],
+    ]
+    return torch.tensor(rows, dtype=torch.float64)
 
 
 def getProjectionMatrix(znear: float, zfar: float, fovX: float, fovY: float) -> Tensor:

@@ -3,6 +3,7 @@
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from groundwork.applications import has_application
 from groundwork.files.image_files import UNREADABLE, open_image
 from groundwork.finding import Finding, Severity, fine
 from groundwork.host.listing import counted, some
+from groundwork.host.machine import threads
 from groundwork.host.start import typed_command
 from scene.checks.photo_files import shrunk
 from scene.checks.shared_pixels import place_of, shared_pixels
@@ -143,16 +145,23 @@ def check_size(smallest: tuple[int, int]) -> Iterator[Finding]:
 def looks_at(views: Sequence[Any], most: int, has_alpha: bool = True) -> list[Look]:
     """Reduce photos in a random order, since every second one may be of another kind; fewer if they are large."""
     order, looks, decoded = np.random.default_rng(0).permutation(len(views)), [], 0.0
-    for number in order[:most]:
-        try:
-            look, cost = _reduce_photo(views[number], has_alpha)
-        except (*UNREADABLE, UserError, AttributeError):
-            continue  # of a reader that reads photos from elsewhere
-        looks.append(look)
-        decoded += cost
-        if decoded > _MOST_DECODED and len(looks) >= _FEWEST:
-            break
+    with ThreadPoolExecutor(threads()) as pool:
+        for found in pool.map(lambda number: _reduce_readable(views[number], has_alpha), order[:most]):
+            if found is None:
+                continue
+            looks.append(found[0])
+            decoded += found[1]
+            if decoded > _MOST_DECODED and len(looks) >= _FEWEST:
+                break  # which cancels the photos that no thread has begun
     return looks
+
+
+def _reduce_readable(view: Any, has_alpha: bool) -> tuple[Look, float] | None:
+    """Do as `_reduce_photo`; None for a photo that cannot be read, or is none of a file."""
+    try:
+        return _reduce_photo(view, has_alpha)
+    except (*UNREADABLE, UserError, AttributeError):
+        return None
 
 
 def _reduce_photo(view: Any, has_alpha: bool) -> tuple[Look, float]:

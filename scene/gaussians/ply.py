@@ -8,7 +8,6 @@ from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 import torch
-from numpy.lib.recfunctions import rename_fields, repack_fields
 from plyfile import PlyParseError
 from torch import Tensor
 
@@ -141,6 +140,8 @@ def read_ply(path: str | os.PathLike, sh_degree: int | None, flat: bool = False,
 
 def _rename_fields(vertices: np.ndarray) -> np.ndarray:
     """The vertices without CloudCompare's prefix of names, and without the SH bands above a model's highest degree."""
+    from numpy.lib.recfunctions import rename_fields, repack_fields  # they take a tenth of a second to import
+
     names = list(vertices.dtype.names or ())
     if "scalar_f_dc_0" in names:
         vertices = rename_fields(vertices, {name: name.removeprefix("scalar_") for name in names})

@@ -18,7 +18,6 @@ import os
 
 import numpy as np
 import torch
-from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement, PlyParseError
 from torch import Tensor
 
@@ -235,6 +234,8 @@ def _measure_from_middle(splats: Splats) -> tuple[np.ndarray, float]:
 
 
 def _make_element(name: str, columns: list[str], values: np.ndarray, kind: str) -> PlyElement:
+    from numpy.lib.recfunctions import unstructured_to_structured  # it takes a tenth of a second to import
+
     form = np.dtype([(column, kind) for column in columns])
     return PlyElement.describe(unstructured_to_structured(values, form), name)
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 from groundwork.files.image_files import UNREADABLE, open_image
 from groundwork.host.listing import as_utf8
@@ -185,6 +185,8 @@ def sheet(
 
     widest: shrink wider images to this width in pixels.
     """
+    from PIL import ImageDraw, ImageFont  # trainings, which import this module, draw nothing
+
     font = ImageFont.load_default(size=15)
     titles = [as_utf8(title) for title in titles]
     cells = [[(as_utf8(label), _shrink(image, widest)) for label, image in row] for row in rows]
@@ -205,7 +207,7 @@ def sheet(
     return drawn
 
 
-def _label_width(font: ImageFont.FreeTypeFont, label: str) -> int:
+def _label_width(font: Any, label: str) -> int:
     """Return the pixels from the left side of an image to the end of its label."""
     return math.ceil(INSET + font.getlength(label) + STROKE) if label else 0
 
