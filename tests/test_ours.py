@@ -41,14 +41,14 @@ MAY = {
     "what this process itself has just made, or files with names of atomic_write, whose process has ended": """
         applications.export.side_files.write_with_folder applications.export.streamed.write_lod_meta
         applications.demo.make_scene.make_scene applications.nerfbaselines.method._begin_training
-        groundwork.files.writing.atomic_write groundwork.files.folders.locked
-        groundwork.files.folders.remove_temporary_files""",
+        groundwork.files.writing.atomic_write groundwork.files.writing.check_folder_can_be_made
+        groundwork.files.folders.locked groundwork.files.folders.remove_temporary_files""",
     "numbered renders, or a reserved name in a model folder, which a training or a rendering makes anew": """
         groundwork.files.image_files.remove_leftovers splatting.commands.render.write_views
         splatting.commands.render.render_set splatting.commands.render.render_sets
         splatting.records.error_curve.continue_curve applications.evaluation.stages._remove_stop splatting.run.open
         splatting.resume.__init__ splatting.resume.ended splatting.resume._may_continue
-        splatting.features.robust_mask_residuals.write_masks""",
+        splatting.features.robust_mask_residuals.write_masks gaussian_renderer.camera_paths.render_path.render_path""",
     "a reserved name in `distorted`, or in a scene that convert.py has made; refuse_foreign_results knows": """
         applications.convert.adding.forget_base applications.convert.adding.keep_base
         applications.convert.mapping.map_photos applications.convert.colmap.copy_database
