@@ -16,6 +16,7 @@ import sys
 import tempfile
 import threading
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -174,11 +175,12 @@ def mapping(job: dict[str, Any]) -> None:
     if way != "grown":
         pycolmap.incremental_mapping(database, photos, job["models"], options)
         return
-    keep(job | {"model": job["base"]})
     options.multiple_models = False
     folder = Path(job["models"], "0")
     folder.mkdir()
-    pycolmap.incremental_mapping(database, photos, str(folder), options, job["base"])
+    with tempfile.TemporaryDirectory(dir=folder.parents[1]) as sound:  # the whole model may still be chosen
+        _leave_out(job["base"], job["left_out"]).write(sound)
+        pycolmap.incremental_mapping(database, photos, str(folder), options, sound)
 
 
 def _choose_photo_folder(job: dict[str, Any]) -> str:
@@ -196,11 +198,17 @@ def _is_dense(database_path: str) -> bool:
 
 def keep(job: dict[str, Any]) -> None:
     """Take the photos `left_out` out of the model in the folder `model`."""
-    model = pycolmap.Reconstruction(job["model"])
-    for name in job["left_out"]:
-        if image := model.find_image_with_name(name):
+    _leave_out(job["model"], job["left_out"]).write(job["model"])
+
+
+def _leave_out(folder: str, names: Sequence[str]) -> pycolmap.Reconstruction:
+    """Read a model without the poses of some photos, which may have none."""
+    model = pycolmap.Reconstruction(folder)
+    for name in names:
+        image = model.find_image_with_name(name)
+        if image and image.has_pose:
             model.deregister_frame(image.frame_id)
-    model.write(job["model"])
+    return model
 
 
 def _make_incremental_options(job: dict[str, Any]) -> pycolmap.IncrementalPipelineOptions:

@@ -34,7 +34,7 @@ def place(camera: np.ndarray, track: np.ndarray, toward: np.ndarray) -> tuple[np
         is_near = along < 1
         deviation = np.linalg.norm(away - np.maximum(along, 1)[:, None] * toward, axis=1)
         weight = 1 / np.maximum(deviation, _COARSE if number < _CONVEX / 2 else _FINE)
-    damping, state = 1e-3, _measure(camera, track, toward, cameras, points)
+    damping, state = 1e-3, _Angles(camera, track, toward, cameras, points)
     for _ in range(_ANGLES):
         away, distance, along, loss = state.away, state.distance, state.along, state.loss
         weight = state.weight / distance**2
@@ -43,7 +43,7 @@ def place(camera: np.ndarray, track: np.ndarray, toward: np.ndarray) -> tuple[np
         missed = np.where(is_behind[:, None], away - distance[:, None] * toward, (across @ away[..., None])[..., 0])
         moves = _solve(camera, track, pull, -weight[:, None] * missed, damping)
         moved = cameras + moves[0], points + moves[1]
-        new = _measure(camera, track, toward, *moved)
+        new = _Angles(camera, track, toward, *moved)
         if new.loss < loss:
             (cameras, points), state, damping = moved, new, max(damping / 4, 1e-8)
             if loss - new.loss < _GAIN * loss:
@@ -53,7 +53,7 @@ def place(camera: np.ndarray, track: np.ndarray, toward: np.ndarray) -> tuple[np
     return cameras, points
 
 
-class _measure:
+class _Angles:
     """Angles between rays and points: the loss, and what a step needs of each ray."""
 
     def __init__(

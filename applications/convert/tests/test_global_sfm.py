@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from applications.convert import worker
 from applications.convert.global_sfm import mapper
 from applications.convert.global_sfm.matches import Matches, read_matches
 from applications.convert.global_sfm.pairs import pose_pairs, read_poses
@@ -156,6 +157,23 @@ def test_the_same_bytes_in_every_run(tmp_path):
         found.write(str(tmp_path / name))
     for file in ("cameras.bin", "images.bin", "points3D.bin"):
         assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+
+def test_mapping_grows_from_the_photos_that_agree_and_leaves_the_whole_model_as_it_is(tmp_path):
+    model, path = _scene(tmp_path)
+    found = _map(path, tmp_path, model)
+    base = tmp_path / "tried" / "direct" / "0"
+    base.mkdir(parents=True)
+    found.write(str(base))
+    before = (base / "images.bin").read_bytes()
+    places = {"models": str(tmp_path / "tried" / "grown"), "base": str(base), "images": str(tmp_path / "photos")}
+    places |= {"database": path, "calibrated": str(tmp_path / "calibrated.db"), "small": str(tmp_path / "none")}
+    out = sorted(image.name for image in found.images.values())[:2]
+    worker.mapping({"mapper": "grown", "left_out": out, "tolerance": 1e-6, **places})
+    grown = pycolmap.Reconstruction(str(tmp_path / "tried" / "grown" / "0"))
+    assert grown.num_reg_images() == FRAMES and _errors(model, grown).max() < 0.02
+    assert (base / "images.bin").read_bytes() == before
+    assert sorted(path.name for path in (tmp_path / "tried").iterdir()) == ["direct", "grown"]
 
 
 def test_pairs_of_chance_are_called_degenerate(tmp_path):
