@@ -1,6 +1,8 @@
 """Events of a training for TensorBoard, with the tags of the reference."""
 
+import math
 import sys
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from io import BytesIO
@@ -59,21 +61,31 @@ class LossEvents(Part):
     def __init__(self, run: Any) -> None:
         self._run = run
         self._kept: list[tuple] = []
+        self._written = -math.inf  # when
 
     def measured(self, at: Iteration, losses: Losses) -> None:
-        """Keep the losses of every tenth iteration; write them in an iteration that is due, which waits for the GPU."""
+        """Keep the losses of every tenth iteration, and write them now and then in one that is due."""
         if at.iteration % INTERVAL == 0 and not at.takes(self._run.launch.test_iterations):
             self._kept.append((at.iteration, losses.l1, losses.total, self._run.clock.seconds - at.started))
-        if at.due and self._kept:
-            with self._run.clock.paused("scoring"):
-                self._write()
+        # Seldom: to stop the clock reads the energy of the GPUs twice, which takes up to 10 ms.
+        if at.due and (at.last or time.monotonic() - self._written >= _FLUSHED):
+            self._write()
+
+    def stepped(self, at: Iteration) -> None:
+        """Write what is kept if a signal ends the training."""
+        if at.stopping:
+            self._write()
 
     def _write(self) -> None:
         """Write the losses that are kept, and wait for the GPU once, not once for each loss."""
-        kept, self._kept = self._kept, []
-        values = torch.stack([loss.detach() for _, *pair, _ in kept for loss in pair]).cpu().view(-1, 2)
-        for (iteration, *_, seconds), (l1, total) in zip(kept, values, strict=True):
-            Events(self._run.writer, iteration).losses(l1, total, seconds)
+        if not self._kept:
+            return
+        with self._run.clock.paused("scoring"):
+            kept, self._kept = self._kept, []
+            values = torch.stack([loss.detach() for _, *pair, _ in kept for loss in pair]).cpu().view(-1, 2)
+            for (iteration, *_, seconds), (l1, total) in zip(kept, values, strict=True):
+                Events(self._run.writer, iteration).losses(l1, total, seconds)
+            self._written = time.monotonic()
 
 
 class EventWriter:
