@@ -14,17 +14,27 @@ def epipolar_angles(shift: np.ndarray, one: np.ndarray, other: np.ndarray) -> tu
 
     shift (..., 3): unit vector from the second camera to the first.
     """
-    across = np.cross(shift, one)
-    missed = (other * across).sum(-1)
-    square = (across**2).sum(-1) + (np.cross(shift, other) ** 2).sum(-1) - 2 * missed**2
+    s, a, b = (np.moveaxis(vectors, -1, 0) for vectors in (shift, one, other))
+    missed = (
+        b[0] * (s[1] * a[2] - s[2] * a[1]) + b[1] * (s[2] * a[0] - s[0] * a[2]) + b[2] * (s[0] * a[1] - s[1] * a[0])
+    )
+    square = 2 - _dot(shift, one) ** 2 - _dot(shift, other) ** 2 - 2 * missed**2  # of |shift x one|, |shift x other|
     slope = np.sqrt(np.maximum(square, 1e-24))
     return missed / slope, slope
 
 
 def is_ahead(shift: np.ndarray, one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Tell which rays meet before both cameras; all as in `epipolar_angles`."""
-    apart = np.cross(one, other)
-    return ((np.cross(other, shift) * apart).sum(-1) > 0) & ((np.cross(one, shift) * apart).sum(-1) > 0)
+    """Tell which rays meet before both cameras; all as in `epipolar_angles`.
+
+    The points where two rays are closest lie at distances with the signs of (other x shift) (one x other) and
+    (one x shift) (one x other).
+    """
+    between, first, second = _dot(one, other), _dot(shift, one), _dot(shift, other)
+    return (between * second > first) & (second > between * first)
+
+
+def _dot(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.einsum("...k,...k->...", one, other)
 
 
 def turn(rotation: np.ndarray, rays: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ class Overlap(NamedTuple):
 
 def collect_shown(image: pycolmap.Image, order: dict[int, int], points: np.ndarray) -> Shown:
     """Return what a photo of a model shows. points: world positions (P, 3). order: by id the row of a point."""
-    seen = [(order[place.point3D_id], place.xy) for place in image.points2D if place.has_point3D()]
+    seen = [(order[place.point3D_id], place.xy) for place in image.get_observation_points2D()]
     numbers = np.array([number for number, _ in seen], np.int64)
     places = np.array([xy for _, xy in seen], float).reshape(-1, 2)
     world = points[numbers]

@@ -39,25 +39,22 @@ _FEW = 100  # tracks of a photo that poses come from
 _START, _START_EACH = 8000, (50, 150)
 _MANY, _MANY_EACH = 45000, (150, 600)
 _CLEAR = 0.125  # of a limit: a pair whose median error is below does not contradict
-_LAST = 4.0  # pixels from the matches' rays and points; COLMAP's limit, too
+# Pixels from the matches' rays and points, before and in the last adjustment, of which COLMAP has the limit.
+_FIRST, _LAST = 12.0, 4.0
 
 
 class _Round(NamedTuple):
     """An adjustment.
 
-    limit: pixels, of matches and tracks. wanted: tracks of a photo, 0: all. width: pixels, of the loss. refined: what
-    of the lenses. tolerance: share of the loss in a step, below which it ends.
+    limit: pixels, of matches and tracks. wanted: tracks of a photo, 0: all. width: pixels, of the loss. refines: the
+    lenses, too. tolerance: share of the loss in a step, below which it ends.
     """
 
     limit: float
     wanted: int = 0
     width: float = 4.0
-    refined: str = ""
+    refines: bool = True
     tolerance: float = 1e-3
-
-
-_FOCAL, _ALL = "focal length", "focal length and distortion"
-_ROUNDS = _Round(20, _FEW, 2, _FOCAL), _Round(8, _FEW, 1, _ALL)
 
 
 class _Rotations(NamedTuple):
@@ -133,9 +130,9 @@ class _Mapper:
         views.posed[:] = False
         views.posed[seen], views.places[seen] = True, places / size
         model = make_model(matches, matches.cameras, views, tracks, points / size)
-        self._adjust(model, _Round(0))
-        last = _Round(_LAST, int(np.clip(_MANY // count, *_MANY_EACH)), 1, _ALL, 1e-4)
-        for one in (*_ROUNDS, last):
+        self._adjust(model, _Round(0, refines=False))
+        many = int(np.clip(_MANY // count, *_MANY_EACH))
+        for one in (_Round(_FIRST, _FEW, 1.5), _Round(_LAST, many, 1, tolerance=1e-4)):
             model = self._triangulate(model, one)
             self._adjust(model, one)
         return _drop_unseen(self._triangulate(model, _Round(_LAST)))
@@ -171,7 +168,7 @@ class _Mapper:
     def _adjust(self, model: pycolmap.Reconstruction, one: _Round) -> None:
         """Adjust poses, points and lenses by COLMAP, under Cauchy's loss."""
         options = pycolmap.BundleAdjustmentOptions(print_summary=False)
-        options.refine_focal_length, options.refine_extra_params = bool(one.refined), one.refined == _ALL
+        options.refine_focal_length, options.refine_extra_params = one.refines, one.refines
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
         options.ceres.loss_function_scale = one.width
         options.ceres.solver_options.function_tolerance = one.tolerance

@@ -104,22 +104,24 @@ def triangulate(
     track, photo = tracks.track, matches.photo[tracks.features]
     limit, start = limits[tracks.features], views.places[photo]
     toward = views.turn(rays[tracks.features], photo)
-    across = np.eye(3) - toward[:, :, None] * toward[:, None, :]
+    # Normal equations of the distances to the rays, by columns: the identity's weight, toward x toward, right side.
+    products = toward[:, [0, 0, 0, 1, 1, 2]] * toward[:, [0, 1, 2, 1, 2, 2]]
+    across = start - toward * (start * toward).sum(1, keepdims=True)
+    columns = np.concatenate([np.ones((len(track), 1)), products, across], 1)
     weight, points, away, error = np.ones(len(track)), np.zeros((tracks.count, 3)), start, limit
     for _ in range(_FITS):
-        pull = across * weight[:, None, None]
-        sums = sum_by(track, pull, tracks.count)
-        sums += 1e-9 * np.trace(sums, axis1=1, axis2=2)[:, None, None] * np.eye(3) + 1e-300 * np.eye(3)
-        middle = sum_by(track, (pull @ start[..., None])[..., 0], tracks.count)
-        points = np.linalg.solve(sums, middle[..., None])[..., 0]
+        sums = sum_by(track, columns * weight[:, None], tracks.count)
+        normal = sums[:, :1, None] * (1 + 1e-9) * np.eye(3) - sums[:, [1, 2, 3, 2, 4, 5, 3, 5, 6]].reshape(-1, 3, 3)
+        points = np.linalg.solve(normal, sums[:, 7:, None])[..., 0]
         away = points[track] - start
-        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        distance = np.maximum(np.sqrt((away**2).sum(1)), 1e-9)
         along = (away * toward).sum(1) / distance
-        error = np.where(along > 0, np.linalg.norm(away / distance[:, None] - along[:, None] * toward, axis=1), 2.0)
+        off = away / distance[:, None] - along[:, None] * toward
+        error = np.where(along > 0, np.sqrt((off**2).sum(1)), 2.0)
         weight = 1 / (1 + (error / limit) ** 2) / distance**2
     fits = error < limit
     direction = away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    mean = sum_by(track[fits], direction[fits], tracks.count)
+    mean = sum_by(track, direction * fits[:, None], tracks.count)
     mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-9)
     widest = np.zeros(tracks.count)
     np.maximum.at(widest, track[fits], np.arccos(np.clip((direction * mean[track]).sum(1), -1, 1))[fits])
